@@ -424,7 +424,7 @@ def test_command_runs_in_any_folder_with_workers(query_file, tmp_path):
     result = json.loads((tmp_path / "out.json").read_text())
     assert f"success {result['success_rate']:>25.4f}" in run.stdout
     assert result["split"] == "test" and result["num_queries"] == 12
-    assert set(result["versions"]) == {"python", "pybullet", "torch", "numpy"}
+    assert set(result["versions"]) == {"python", "pybullet", "onnxruntime", "torch", "numpy"}
     assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
     assert sorted(os.listdir(tmp_path)) == ["out.json", "out.png"]
 
@@ -442,7 +442,7 @@ def test_errors_of_the_command_are_one_line_before_any_work(
     cases = [
         ({"policy": "go-to-gaol"}, "no such policy: go-to-gaol: did you mean go-to-goal?"),
         ({"policy": encoder}, "encoder.onnx: a network, but not a policy"),
-        ({"policy": unfit}, "unfit.onnx: its input desired_goal has the shape"),
+        ({"policy": unfit}, "unfit.onnx: its input achieved_goal has the shape"),
         ({"policy": policy, "goal-type": "ee"}, "trained with the goal type 'config'"),
         ({"task": "wal"}, "unknown task 'wal': did you mean wall?"),
         ({"task": "wall"}, "this file is for the task 'no_obstacles', not 'wall'"),

@@ -383,15 +383,15 @@ BOMBS = {
 
 
 LOAD = """
-import json, resource, sys, time
+import json, sys, time
 from roboarm_nmp.networks.network_file import load_network
 try:
     load_network(sys.argv[1])
     error = ""
 except ValueError as caught:
     error = str(caught)
-usage = resource.getrusage(resource.RUSAGE_SELF)
-print(json.dumps([error, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1e6]))
+[peak] = [line for line in open("/proc/self/status") if line.startswith("VmHWM")]
+print(json.dumps([error, time.process_time(), int(peak.split()[1]) / 1e6]))
 """
 
 

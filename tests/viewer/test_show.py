@@ -204,7 +204,7 @@ def test_errors_are_one_line_and_write_nothing(tmp_path, capsys, monkeypatch):
         (["wall", "--output", tmp_path / "out.jpg"], "must end in .png or .gif"),
         (["wall", *png, "--query", many], f"no test query {many}: the numbers are 0 to {many - 1}"),
         (["wall", *gif, "--draws", 2], "--draws goes with --output FILE.png"),
-        (["wall", *gif, "--policy", unfit], "unfit.onnx: its input desired_goal has the shape"),
+        (["wall", *gif, "--policy", unfit], "unfit.onnx: its input achieved_goal has the shape"),
         (["benchmaker_bookshelf_tall", *gif, "--policy", "demo"], "has no demonstrations"),
         (["wall", *gif, "--trajectory", tmp_path / "none.csv"], "none.csv: No such file"),
         (["wall", *gif, "--save-trajectory", tmp_path / "a.txt"], "must end in .csv, .npz"),

@@ -29,7 +29,10 @@ class _ByName(torch.nn.Module):
         self.names = names
 
     def forward(self, *inputs):
-        return self.module(**dict(zip(self.names, inputs, strict=True)))
+        outputs = self.module(**dict(zip(self.names, inputs, strict=True)))
+        if isinstance(outputs, torch.Tensor):
+            outputs = [outputs]
+        return [output.clone() for output in outputs]  # one may be an input
 
 
 def save_network(

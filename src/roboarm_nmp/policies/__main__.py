@@ -2,19 +2,24 @@
 
 roboarm policies
 roboarm policies sac-ee-wall-p1-s1
+roboarm policies sac-ee-wall-p1-s1 --export policy.onnx
 """
 
 import argparse
 import json
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
-from roboarm_nmp.policies.registry import PolicyError, pretrained_policies
+from roboarm_nmp.networks.network_file import load_network
+from roboarm_nmp.policies.baselines import BASELINES
+from roboarm_nmp.policies.registry import PolicyError, find_policy, pretrained_policies
+from roboarm_nmp.utils.files import write_atomically
 from roboarm_nmp.utils.signals import error_line
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command. Returns the exit code: 0, or 2 for a policy that does not exist."""
+    """Run the command. Returns the exit code: 0, or 2 for an error."""
     parser = argparse.ArgumentParser(
         prog="roboarm policies",
         description="List the pretrained policies and scene encoders, or show one policy. Success "
@@ -25,8 +30,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--json", action="store_true", help="print JSON, with all flags of training"
     )
+    parser.add_argument(
+        "--export",
+        type=Path,
+        metavar="FILE",
+        help="copy the ONNX file of the policy NAME (here also a run's folder or a file) to FILE, "
+        "and print its inputs and outputs (docs/guide/run_elsewhere.md)",
+    )
     options = parser.parse_args(arguments)
-    # Here, so that --help need not wait for PyTorch.
+    if options.export is not None:
+        if options.name is None:
+            parser.error("--export needs the NAME of a policy")
+        try:
+            print(_export(options.name, options.export))
+        except (PolicyError, OSError) as error:
+            print(error_line(error), file=sys.stderr)
+            return 2
+        return 0
+    # Here, so that --help need not wait for it.
     from roboarm_nmp.envs.perception.encoders import pretrained_encoders
     from roboarm_nmp.policies.cards import encoder_card, policy_card
 
@@ -45,6 +66,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     else:
         print(_policies(policies), _encoders(encoders), sep="\n\n")
     return 0
+
+
+def _export(name, path):
+    """Copy a policy's network file; its inputs and outputs in words."""
+    source, _ = find_policy(name)
+    if source in BASELINES:
+        raise PolicyError(f"{name} is a baseline, which has no network file")
+    write_atomically(path, Path(source).read_bytes())
+    network = load_network(path)
+    rows = [("", "name", "shape, float32")]
+    for kind, shapes in (("input", network.inputs), ("output", network.outputs)):
+        for tensor, shape in shapes.items():
+            sizes = ", ".join("N" if size is None else str(size) for size in shape)
+            rows.append((kind, tensor, f"({sizes})"))
+    return f"{path}\n{_aligned(rows, numbers=0)}"
 
 
 def _policies(cards):

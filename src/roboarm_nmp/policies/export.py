@@ -13,10 +13,9 @@ from typing import Any
 import torch
 
 from roboarm_nmp import envs
-from roboarm_nmp.envs.robots.metadata import robot_metadata
 from roboarm_nmp.networks.export import save_network
 from roboarm_nmp.networks.untrusted import NetworkError
-from roboarm_nmp.policies.registry import ENV_ARGUMENTS, OUTPUTS, PolicyError
+from roboarm_nmp.policies.registry import ENV_ARGUMENTS, OUTPUTS, PolicyError, policy_metadata
 from roboarm_nmp.policies.safety_filter import SafetyFilter
 
 
@@ -60,14 +59,8 @@ def save_policy(
         name: torch.stack([torch.from_numpy(observation[name]) for observation in observations])
         for name in observations[0]
     }
-    metadata = {
-        "kind": "policy",
-        "task": str(task),
-        "env": {"goal_type": env.goal_type, **env_arguments},
-        **robot_metadata(robot),
-    }
-    if safety_filter is not None:
-        metadata["safety_filter"] = safety_filter.to_metadata()
+    arguments = {"goal_type": env.goal_type, **env_arguments}
+    metadata = policy_metadata(task, arguments, robot, safety_filter)
     with torch.no_grad():
         action = copy.deepcopy(module).cpu().eval()(**example)
     shape = (len(observations), robot.num_joints)

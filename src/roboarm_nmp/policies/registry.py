@@ -18,6 +18,10 @@ import numpy as np
 
 from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.goals import GOAL_TYPES
+from roboarm_nmp.envs.robots.metadata import check_robot, robot_metadata
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.networks.network_file import Network, load_network
+from roboarm_nmp.networks.untrusted import NetworkError
 from roboarm_nmp.policies.baselines import (
     BASELINES,
     OMPL_PLANNERS,
@@ -32,7 +36,6 @@ from roboarm_nmp.policies.pose_goals import ConfigurationGoals
 from roboarm_nmp.utils.names import suggest
 
 if TYPE_CHECKING:  # Numba takes a while to import
-    from roboarm_nmp.networks.network_file import Network
     from roboarm_nmp.policies.safety_filter import SafetyFilter
 
 # The arguments of an environment that a policy's metadata may contain. Tolerances and horizon are
@@ -148,6 +151,25 @@ def recurrent_size(policy: Any) -> int:
             f"a policy's recurrent state has 0 to {MAX_RECURRENT_SIZE:,} numbers, not {size!r}"
         )
     return size
+
+
+def policy_metadata(
+    task: str | Path,
+    env_arguments: dict[str, Any],
+    robot: Robot,
+    safety_filter: "SafetyFilter | None",
+) -> dict[str, Any]:
+    """The metadata of a policy's network file (docs/reference/file_formats.md)."""
+    metadata = {
+        "kind": "policy",
+        "task": str(task),
+        "env": env_arguments,
+        "joint_limits": [robot.lower.tolist(), robot.upper.tolist()],
+        **robot_metadata(robot),
+    }
+    if safety_filter is not None:
+        metadata["safety_filter"] = safety_filter.to_metadata()
+    return metadata
 
 
 def make_policy(
@@ -266,15 +288,13 @@ def _translated(begin, goals):
 class _TrainedPolicy(NamedTuple):
     """A policy network, and what its metadata say."""
 
-    network: "Network"
+    network: Network
     env_arguments: dict[str, Any]
     safety_filter: "SafetyFilter | None"
     recurrent_size: int
 
 
 def _load(path: str | Path) -> _TrainedPolicy:
-    from roboarm_nmp.networks.network_file import load_network
-    from roboarm_nmp.networks.untrusted import NetworkError
     from roboarm_nmp.policies.safety_filter import SafetyFilter
 
     try:
@@ -296,9 +316,6 @@ def _load(path: str | Path) -> _TrainedPolicy:
 
 def _trained(path, env):
     """`make_policy` of a policy network, and its `ConfigurationGoals`, None if it needs none."""
-    from roboarm_nmp.envs.robots.metadata import check_robot
-    from roboarm_nmp.networks.untrusted import NetworkError
-
     network, trained, _, size = _load(path)
     robot = env.unwrapped.robot
     try:

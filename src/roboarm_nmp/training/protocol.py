@@ -21,13 +21,12 @@ from roboarm_nmp import envs
 from roboarm_nmp.datasets.episodes import DemoQueriesWrapper, load_demos_for
 from roboarm_nmp.datasets.queries import Queries, load_queries
 from roboarm_nmp.envs.arm_env import HORIZON, STANDARD_RULES, deviations
-from roboarm_nmp.envs.robots.metadata import robot_metadata
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.evaluation.rollout import render_strip, rollouts
 from roboarm_nmp.networks.export import read_weights, save_network
 from roboarm_nmp.networks.network_file import load_network
-from roboarm_nmp.policies.registry import OUTPUTS, policy_file, recurrent_size
+from roboarm_nmp.policies.registry import OUTPUTS, policy_file, policy_metadata, recurrent_size
 from roboarm_nmp.training.collection import FinishedEpisode, TrainingEnvs
 from roboarm_nmp.training.cuda_graphs import to_device
 from roboarm_nmp.training.runs import Run, RunFlags, check_finite, errors_of, fail, script_name
@@ -406,14 +405,8 @@ class PolicyRun(Run):
             policy: the module, `forward(observation, achieved_goal, desired_goal)`, and what else
                 is observed; with a `recurrent_size`, its `recurrent_state`, too.
         """
-        metadata = {
-            "kind": "policy",
-            "task": self.args.task,
-            "env": self.env_arguments,
-            **robot_metadata(self.eval_envs[0].unwrapped.robot),
-        }
-        if self.safety_filter is not None:
-            metadata["safety_filter"] = self.safety_filter.to_metadata()
+        robot = self.eval_envs[0].unwrapped.robot
+        metadata = policy_metadata(self.args.task, self.env_arguments, robot, self.safety_filter)
         metadata.update(script=script_name(), seed=self.args.seed, step=self.step)
         example = stack([env.reset(seed=0)[0] for env in self.eval_envs[:2]], self.device)
         if size := recurrent_size(policy):

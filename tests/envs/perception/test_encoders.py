@@ -88,9 +88,9 @@ def test_network_encodes_what_its_sensors_observe(network):
     encoder = make_encoder(network)
     assert encoder.sensors == SENSORS and encoder.size == encoder.token_size == 6
     observed = encoder.observe(BALL)
-    assert observed["front"].shape == (1, 8, 8, 3) and observed["cloud_points"].shape == (1, 400, 3)
-    colour = observed["front"].float().mean((0, 1, 2)) / 255
-    expected = np.concatenate([colour, observed["cloud_points"].mean((0, 1))])
+    assert observed["front"].shape == (8, 8, 3) and observed["cloud_points"].shape == (400, 3)
+    colour = observed["front"].mean((0, 1)) / 255
+    expected = np.concatenate([colour, observed["cloud_points"].mean(0)])
     np.testing.assert_allclose(encoder(BALL), expected, rtol=1e-6)
     assert (encoder(BALL) != encoder(Scene(()))).all()
 
