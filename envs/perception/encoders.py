@@ -1,7 +1,7 @@
 """Scene encoders: from a `Scene` to z_E, the latent code that a policy receives of the scene.
 
     encoder = make_encoder("vae")                         # pretrained, by name
-    encoder = make_encoder("runs/RUN/encoder.onnx")         # a network file
+    encoder = make_encoder("runs/RUN/encoder.onnx")       # a network file
     encoder = make_encoder("oracle")                      # ground-truth obstacles (privileged)
     encoder = make_encoder("point_cloud", num_points=32)  # points that four sensors observe
     encoder = make_encoder("point_cloud", geometry_source="field")  # points decoded from z_E

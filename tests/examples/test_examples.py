@@ -1,15 +1,20 @@
 """The scripts in examples/ run as their docstrings say, and print what these say."""
 
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 from paths import ROOT
 from trainers import run_here
 
+import roboarm_nmp
 from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.motions.trajectories import load_joint_path
+from roboarm_nmp.policies import __main__ as policies
+from roboarm_nmp.policies.registry import make_policy
 from roboarm_nmp.viewer import show
 
 
@@ -56,3 +61,43 @@ def test_own_points_lead_to_actions_that_avoid_them(run, tmp_path):
     np.save(tmp_path / "cloud.npy", np.full((10, 3), 3.0))
     output = run("point_cloud_to_action.py", "--points", "cloud.npy")
     assert "0 points; the straight motion to the goal is free" in output  # out of reach
+
+
+BLOCKED = """
+import sys
+
+
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("roboarm_nmp", "torch", "pybullet"):
+            raise ImportError(name)
+
+
+sys.meta_path.insert(0, Blocked())
+"""
+
+
+def test_policy_runs_with_onnx_runtime_alone(tmp_path, capsys):
+    """The first step is the environment's, and the guide shows the example as it is."""
+    name, file = "bc-config-double_walls-s1", tmp_path / "policy.onnx"
+    assert policies.main([name, "--export", str(file)]) == 0
+    table = capsys.readouterr().out
+    script = ROOT / "examples" / "run_with_onnx_runtime.py"
+    code = BLOCKED + script.read_text()
+    process = subprocess.run(
+        [sys.executable, "-c", code, file], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    env = roboarm_nmp.make("no_obstacles", goal_type="config")
+    start = np.array([0.0, -0.4, 0.0, -2.2, 0.0, 1.8, 0.8])
+    goal = np.array([1.2, 0.1, 0.2, -1.9, 0.1, 2.0, 0.9])
+    observation, _ = env.reset_specific(start, goal)
+    act, _ = make_policy(file, env)(0, None)
+    action = act(observation)
+    action *= min(1.0, env.max_step / np.linalg.norm(action))
+    expected = env.robot.denormalise(env.robot.normalise(start) + action)
+    np.testing.assert_allclose(np.array(process.stdout.split(), float), expected, atol=1e-4)
+    page = (ROOT / "docs" / "guide" / "run_elsewhere.md").read_text()
+    lines = script.read_text().partition('"""\n\n')[2]
+    assert f"```python\n{lines}```" in page
+    assert table.partition("\n")[2] in page
+    assert len([line for line in lines.splitlines() if line]) <= 25

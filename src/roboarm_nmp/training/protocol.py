@@ -210,7 +210,7 @@ def evaluate(
 
     Args:
         policy: from `observation`, `achieved_goal`, `desired_goal` and what else is observed,
-            tensors (N, ...), to actions (N, n); a module or an exported network. A recurrent one
+            tensors (N, ...), to actions (N, n); a module or a loaded network. A recurrent one
             (`policies.registry.recurrent_size`) also receives its state, and returns the next.
         envs: the environments to do it in.
         queries: `datasets.queries.Queries`, or a list of `Query`.
