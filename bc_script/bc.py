@@ -11,6 +11,8 @@ your own, copy this file and change the parts under `# ALGO LOGIC`. Parts betwee
 
 import functools
 import math
+import os
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -20,17 +22,49 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
+import roboarm_nmp
 from roboarm_nmp.datasets.demonstrations import load_demo_files
 from roboarm_nmp.datasets.episodes import observed
 from roboarm_nmp.envs.subgoals import MAX_STEP
-from roboarm_nmp.training import cuda_graphs, protocol, runs
+from roboarm_nmp.envs.tasks import task_name
+from roboarm_nmp.evaluation.evaluate import evaluate, first_episode_images
+from roboarm_nmp.policies.export import save_policy
+from roboarm_nmp.training.arguments import errors_of, parse_args
+from roboarm_nmp.training.cuda_graphs import adam, graphed, set_learning_rate
+from roboarm_nmp.training.final_test import RESULTS, finish, load_task
 from roboarm_nmp.training.network_parts import Bf16Linear, pose_difference
+from roboarm_nmp.training.runs import Run, script_name, seed_torch
 from roboarm_nmp.utils import flags
 
 
+# SHARED: flags of the run
 @dataclass
-class Args(protocol.PolicyFlags):
-    # More flags: `roboarm_nmp.training.protocol` (task), `roboarm_nmp.training.runs` (run).
+class RunArgs:
+    task: str = "no_obstacles"
+    """a task of `roboarm_nmp.TASKS` or a scene file; with another arm TASK@FILE, a robot's file"""
+    seed: flags.Seed = 1
+    """seed of all random numbers; runs with the same seed, machine and device are identical"""
+    eval_queries: flags.PositiveInt = 200
+    """validation queries per evaluation; the best policy is saved"""
+    test_queries: flags.NonNegativeInt = 1_000
+    """test queries for the best policy at the end (0: no test)"""
+    capture_video: bool = False
+    """a video of the first validation query per evaluation, in TensorBoard and as a file"""
+    runs_dir: Path = Path("runs")
+    """parent of the run's folder: TensorBoard events, checkpoint, `policy.onnx`, result.json"""
+    resume: Path | None = None
+    """continue the run in this folder from its last checkpoint, with its flags"""
+    device: str = "cpu"
+    """`cpu`, `cuda` or one of several, `cuda:1`"""
+    track: bool = False
+    """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
+
+
+# END SHARED
+
+
+@dataclass
+class Args(RunArgs):
     goal_type: Literal["ee", "config", "combined", "pose"] = "combined"
     """what the goal is: end-effector position, configuration, both, or end-effector pose"""
     demos: tuple[Path, ...] = ()
@@ -60,14 +94,12 @@ class Args(protocol.PolicyFlags):
     bf16: bool = False
     """train with hidden layers in bfloat16"""
     encoder: str | None = None
-    """the encoded scene, appended to the observation: an encoder's latent code (`vae`, `vqvae`,
-    `pointnet2`, `field`, or the path of your own `encoder.onnx`, docs/guide/perception.md),
-    `point_cloud` for observed points, or `oracle` for the ground-truth obstacles; by default
-    nothing"""
+    """the encoded scene in the observation: latent code (`vae`, `vqvae`, `pointnet2`, `field`, or
+    the path of your own `encoder.onnx`), `point_cloud`, or `oracle` (ground-truth obstacles)"""
     num_points: flags.PositiveInt = 64
     """points of the encoder `point_cloud`"""
     eval_every: flags.PositiveInt = 50_000
-    """updates between evaluations on validation queries; the best policy is saved"""
+    """updates between evaluations on validation queries"""
 
 
 # ALGO LOGIC: the policy
@@ -196,60 +228,81 @@ def update(actor, optimizer, batch):
     return {"negative_log_likelihood": loss}
 
 
+LOG_SECONDS = 10  # between two logs of the losses
+
 if __name__ == "__main__":
-    args = runs.parse_args(Args, may_change={"total_updates", "test_queries"})
-    device = runs.seed_torch(args)
-    validation, test = protocol.load_task(args)
-    with runs.errors_of("--demos"):
+    args = parse_args(Args, may_change={"total_updates", "test_queries"})
+    device = seed_torch(args)
+    validation, test = load_task(args)
+    with errors_of("--demos"):
         demos = load_demo_files(args.demos, args.task, args.num_demos)
     env_arguments = {
         "goal_type": args.goal_type,
         "encoder": args.encoder,
         "num_points": args.num_points,
     }
-    eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
+    with errors_of("--encoder"):
+        env = roboarm_nmp.make(args.task, **env_arguments)  # for its spaces
 
     # ALGO LOGIC: data
     data = [torch.as_tensor(array, device=device) for array in transitions(demos, args.goal_type)]
 
     # ALGO LOGIC: network and optimiser
-    actor = Actor(args, eval_envs[0]).to(device)
-    actor_average = Actor(args, eval_envs[0]).to(device).eval()  # evaluated and saved
+    actor = Actor(args, env).to(device)
+    actor_average = Actor(args, env).to(device).eval()  # evaluated and saved
     actor_average.load_state_dict(actor.state_dict())
-    optimizer = cuda_graphs.adam(actor.parameters(), args.learning_rate, args, device)
-    learn = cuda_graphs.graphed(functools.partial(update, actor, optimizer), args, device)
+    optimizer = adam(actor.parameters(), args.learning_rate, device)
+    learn = graphed(functools.partial(update, actor, optimizer), device)
+    progress = {"evaluated": 0, "best": -1.0, "best_step": 0}
     state = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
-    run = protocol.PolicyRun(args, state, device, env_arguments, eval_envs, validation)
+    run = Run(args, task_name(args.task), state | {"progress": progress})
 
     latents = None  # the encoded scene of each demonstration; the first time takes minutes
     if args.encoder is not None:
-        with runs.errors_of("--encoder"):
-            encoded = eval_envs[0].encoder.encode_demos(demos)
-        latents = torch.as_tensor(encoded, device=device)
+        with errors_of("--encoder"):
+            latents = torch.as_tensor(env.encoder.encode_demos(demos), device=device)
     del demos
+    logged = 0.0
     run.start(args.total_updates, "update")
-    run.repeat_evaluation(actor_average)
 
-    while run.step < args.total_updates:
+    while True:
+        # Evaluate, keep the best policy
+        due = run.step % args.eval_every == 0 or run.step >= args.total_updates
+        if due and run.step > progress["evaluated"]:
+            run.save()  # a run that is stopped while it evaluates repeats the evaluation
+            run.interruptible = True
+            latest = run.folder / "latest.onnx"
+            origin = {"script": script_name(), "seed": args.seed, "step": run.step}
+            save_policy(latest, actor_average, args.task, None, origin, **env_arguments)
+            result = evaluate(latest, args.task, queries=validation)
+            run.log({f"eval/{name}": result[name] for name in RESULTS})
+            if args.capture_video:
+                images = first_episode_images(latest, args.task, 40, queries=validation)
+                run.log_video("eval/episode", images)
+            run.interruptible = False
+            progress["evaluated"] = run.step
+            if result["success_rate"] >= progress["best"]:
+                progress |= {"best": result["success_rate"], "best_step": run.step}
+                os.replace(latest, run.folder / "policy.onnx")
+        if run.step >= args.total_updates:
+            break
+
         # ALGO LOGIC: learn
         remaining = 1.0 - run.step / args.total_updates if args.anneal else 1.0
-        learning_rate = args.learning_rate * remaining
-        cuda_graphs.set_learning_rate(optimizer, learning_rate)
+        set_learning_rate(optimizer, args.learning_rate * remaining)
         rows = torch.randint(len(data[0]), (args.batch_size,), device=device)
         observation, goal, action, demo_index = (tensor[rows] for tensor in data)
         if latents is not None:
             observation = torch.cat([observation, latents[demo_index]], dim=1)
         losses = learn({"observation": observation, "goal": goal, "action": action})
         polyak_update(actor_average, actor, args.policy_average)
-        step = run.advance()
-        if step % 1000 == 0:
+        run.advance()
+        if time.monotonic() - logged > LOG_SECONDS or run.step == 1:
+            logged = time.monotonic()
             run.log({f"losses/{name}": value for name, value in losses.items()})
-            run.log({"charts/learning_rate": learning_rate, "charts/SPS": int(run.rate)})
-
-        # Evaluate, save the best policy, checkpoint
-        evaluating = step % args.eval_every == 0 or step == args.total_updates
-        if evaluating and run.validate(actor_average):
-            run.save_policy(actor_average)
-        if evaluating or run.interrupted:
-            run.checkpoint()
-    run.final_test(test)
+            run.log(
+                {"charts/learning_rate": args.learning_rate * remaining, "charts/SPS": run.rate}
+            )
+        if run.interrupted:
+            run.save()
+    finish(run, test, progress["best"], progress["best_step"])

@@ -13,6 +13,8 @@ your own, copy this file and change the parts under `# ALGO LOGIC`; `# SHARED` i
 
 import functools
 import itertools
+import os
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -22,26 +24,60 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
+import roboarm_nmp
 from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.goals import GOAL_TYPES
 from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 from roboarm_nmp.envs.subgoals import MAX_STEP
+from roboarm_nmp.envs.tasks import task_name
+from roboarm_nmp.evaluation.evaluate import evaluate, first_episode_images
+from roboarm_nmp.evaluation.rollout import rollout
+from roboarm_nmp.networks.export import read_weights
+from roboarm_nmp.policies.export import save_policy
+from roboarm_nmp.policies.registry import policy_file
 from roboarm_nmp.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
-from roboarm_nmp.training import cuda_graphs, protocol, runs
+from roboarm_nmp.training.arguments import errors_of, fail, parse_args
+from roboarm_nmp.training.cuda_graphs import adam, graphed, set_learning_rate, to_device
+from roboarm_nmp.training.final_test import RESULTS, finish, load_task
 from roboarm_nmp.training.network_parts import Bf16Linear, pose_difference
+from roboarm_nmp.training.runs import Run, script_name, seed_torch
 from roboarm_nmp.utils import flags, workers
 from roboarm_nmp.utils.progress import progress_bar
 from roboarm_nmp.utils.random_streams import Stream
 
 
+# SHARED: flags of the run
 @dataclass
-class Args(protocol.PolicyFlags):
-    # More flags: `roboarm_nmp.training.protocol` (task), `roboarm_nmp.training.runs` (run).
+class RunArgs:
+    task: str = "no_obstacles"
+    """a task of `roboarm_nmp.TASKS` or a scene file; with another arm TASK@FILE, a robot's file"""
+    seed: flags.Seed = 1
+    """seed of all random numbers; runs with the same seed, machine and device are identical"""
+    eval_queries: flags.PositiveInt = 200
+    """validation queries per evaluation; the best policy is saved"""
+    test_queries: flags.NonNegativeInt = 1_000
+    """test queries for the best policy at the end (0: no test)"""
+    capture_video: bool = False
+    """a video of the first validation query per evaluation, in TensorBoard and as a file"""
+    runs_dir: Path = Path("runs")
+    """parent of the run's folder: TensorBoard events, checkpoint, `policy.onnx`, result.json"""
+    resume: Path | None = None
+    """continue the run in this folder from its last checkpoint, with its flags"""
+    device: str = "cpu"
+    """`cpu`, `cuda` or one of several, `cuda:1`"""
+    track: bool = False
+    """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
+
+
+# END SHARED
+
+
+@dataclass
+class Args(RunArgs):
     task: str = "random_boxes_hard"
-    """task to evaluate on, one of `roboarm_nmp.TASKS`, or a scene file (docs/customise/scene.md);
-    with another arm TASK@FILE, a robot's file (docs/customise/robot.md)"""
+    """task to evaluate on, a task of `roboarm_nmp.TASKS` or a scene file; or TASK@FILE"""
     goal_type: Literal["config", "combined", "pose"] = "combined"
     """what the goal is: configuration, that and end-effector position, or end-effector pose"""
     paths: tuple[Path, ...] = (Path("roadmaps"),)
@@ -108,7 +144,7 @@ class Args(protocol.PolicyFlags):
     round_weight: flags.NonNegativeFloat = 5.0
     """probability of a visited state in a batch, relative to an example of the pool"""
     eval_every: flags.PositiveInt = 4_000
-    """updates between evaluations on validation queries; the best policy is saved"""
+    """updates between evaluations on validation queries"""
 
 
 # ALGO LOGIC: the policy
@@ -222,7 +258,7 @@ class Actor(nn.Module):
 
 
 # ALGO LOGIC: one update
-def update(actor, optimizer, batch, length_weight):
+def update(actor, optimizer, length_weight, batch):
     """One step on a batch of examples. Returns the losses before it."""
     inputs = ("observation", "desired_goal", "link_distances", "goal_link_distances")
     direction, length = actor.outputs(**{name: batch[name] for name in inputs})
@@ -249,18 +285,19 @@ def dagger_round(actor, env, safety_filter, examples, args, step, device):
     reached = []
     visited = []
 
-    def act(**observation):
-        visited.append(observation["observation"][0, : robot.num_joints].cpu().numpy())
-        return actor(**observation)
+    @torch.no_grad()
+    def act(observation):
+        visited.append(observation["observation"][: robot.num_joints])
+        tensors = {name: to_device(array[None], device) for name, array in observation.items()}
+        return actor(**tensors)[0].cpu().numpy()
 
     for _ in progress_bar(range(args.round_queries), "round", unit="query", transient=True):
         number, ends = examples.random_query(rng)
         start, goal = robot.denormalise(ends).astype(np.float32)
         query = Query(start, goal, examples.paths.scenes[number])
         visited.clear()
-        seed = int(rng.integers(2**32))  # of the random-walk escapes
-        result = protocol.evaluate(act, [env], [query], device, safety_filter, seed)
-        reached.append(result["success_rate"])
+        trajectory = rollout(env, query, safety_filter.filter_policy(act, env, rng))
+        reached.append(trajectory.success)
         if not visited:  # the start was at the goal
             continue
         states = np.array(visited)
@@ -270,12 +307,13 @@ def dagger_round(actor, env, safety_filter, examples, args, step, device):
         count = min(args.round_labels, len(states))
         states = states[rng.choice(len(states), count, False, weights / weights.sum())]
         parts.append(examples.label(number, states, np.repeat(ends[1:], count, axis=0), rng))
-    return concat([on_device(part, device) for part in parts]), np.mean(reached)
+    new = concat([on_device(part, device) for part in parts]) if parts else {}
+    return new, np.mean(reached)
 
 
 # ALGO LOGIC: batches, dicts of tensors
 def on_device(examples, device):
-    return {name: cuda_graphs.to_device(array, device) for name, array in examples.items()}
+    return {name: to_device(array, device) for name, array in examples.items()}
 
 
 def concat(parts):
@@ -288,27 +326,39 @@ def sample(examples, number):
     return {name: tensor[rows] for name, tensor in examples.items()}
 
 
+def copy_weights(policy, module):
+    """Give a module the weights of a policy of the same sizes: `--initial-policy`."""
+    with errors_of("--initial-policy"):
+        weights = read_weights(policy_file(policy))
+        for name, parameter in module.named_parameters():
+            if name not in weights or weights[name].shape != parameter.shape:
+                raise ValueError(f"{policy}: the sizes of its layers or its goal type are others")
+            parameter.data.copy_(torch.from_numpy(weights[name]))
+
+
 def without_padding(latents, token_size):
     """Encoded scenes (scenes, z), without the tokens at the end that no scene has."""
     tokens = latents.unflatten(1, (-1, token_size))
     return tokens[:, : max(int((tokens != 0.0).any(2).sum(1).max()), 1)].flatten(1)
 
 
+LOG_SECONDS = 10  # between two logs of the losses
+
 if __name__ == "__main__":
-    args = runs.parse_args(Args, may_change={"test_queries", "workers"})
-    device = runs.seed_torch(args)
-    validation, test = protocol.load_task(args)
+    args = parse_args(Args, may_change={"test_queries", "workers"})
+    device = seed_torch(args)
+    validation, test = load_task(args)
     num_draws = args.pool_size // args.examples_per_update
     if num_draws < 1:
-        runs.fail("--pool-size must be at least --examples-per-update")
+        fail("--pool-size must be at least --examples-per-update")
     robot = validation.scenes.base.robot
-    with runs.errors_of("--encoder"):
+    with errors_of("--encoder"):
         encoder = make_encoder(args.encoder, args.num_points)
         encoder.check_robot(robot)
-    with runs.errors_of("--geometry-source"):
+    with errors_of("--geometry-source"):
         geometry_source = args.geometry_source or encoder.geometry_source
         find_checker = find_geometry_source(geometry_source, robot)
-    with runs.errors_of("--paths"):
+    with errors_of("--paths"):
         paths = load_roadmap_paths(args.paths, robot)
     env_arguments = {
         "goal_type": args.goal_type,
@@ -317,34 +367,30 @@ if __name__ == "__main__":
         "geometry_source": geometry_source,
         "link_distances": True,
     }
-    eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
+    with errors_of("--encoder"):
+        env = roboarm_nmp.make(args.task, **env_arguments)
     safety_filter = SafetyFilter(args.safety_margin, args.escape)
 
     # ALGO LOGIC: network and optimiser
-    actor = Actor(args, eval_envs[0]).to(device)
+    actor = Actor(args, env).to(device)
     if args.initial_policy is not None:
-        protocol.copy_weights(args.initial_policy, actor)
-    actor_average = Actor(args, eval_envs[0]).to(device).eval()  # evaluated and saved
+        copy_weights(args.initial_policy, actor)
+    actor_average = Actor(args, env).to(device).eval()  # evaluated and saved
     actor_average.load_state_dict(actor.state_dict())
-    optimizer = cuda_graphs.adam(actor.parameters(), args.learning_rate, args, device)
-    learn = cuda_graphs.graphed(functools.partial(update, actor, optimizer), args, device)
+    optimizer = adam(actor.parameters(), args.learning_rate, device)
+    learn = graphed(functools.partial(update, actor, optimizer, args.length_weight), device)
     visited = {}  # examples of all rounds
-    state = {
-        "actor": actor,
-        "actor_average": actor_average,
-        "optimizer": optimizer,
-        "visited": visited,
-    }
-    run = protocol.PolicyRun(
-        args, state, device, env_arguments, eval_envs, validation, safety_filter
-    )
-    visited |= on_device(visited, device)
+    progress = {"evaluated": 0, "best": -1.0, "best_step": 0}
+    state = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
+    state |= {"visited": visited, "progress": progress}
+    run = Run(args, task_name(args.task), state)
+    visited |= {name: tensor.to(device) for name, tensor in visited.items()}
 
     # Here, because SciPy and Numba take a while to import, which --help would wait for.
     from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
 
     # ALGO LOGIC: data. The pool is not in checkpoints: a resumed run draws the same examples again.
-    latents = torch.as_tensor(eval_envs[0].encoder.encode_demos(paths), device=device)
+    latents = torch.as_tensor(env.encoder.encode_demos(paths), device=device)
     latents = without_padding(latents, actor.token_size)
     examples = RoadmapExamples(paths, find_checker, args.seed, args.goal_type)
     draw = functools.partial(examples.draw, count=args.examples_per_update, noise=args.noise)
@@ -352,14 +398,36 @@ if __name__ == "__main__":
     pool = [next(draws) for _ in progress_bar(range(num_draws), "drawing examples", unit="batch")]
     first = run.step % num_draws
     pool = concat([on_device(part, device) for part in pool[-first:] + pool[:-first]])
+    logged = 0.0
     run.start(args.total_updates, "update")
-    run.repeat_evaluation(actor_average)
 
-    while run.step < args.total_updates:
+    while True:
+        # Evaluate, keep the best policy
+        due = run.step % args.eval_every == 0 or run.step >= args.total_updates
+        if due and run.step > progress["evaluated"]:
+            run.save()  # a run that is stopped while it evaluates repeats the evaluation
+            run.interruptible = True
+            latest = run.folder / "latest.onnx"
+            origin = {"script": script_name(), "seed": args.seed, "step": run.step}
+            save_policy(latest, actor_average, args.task, safety_filter, origin, **env_arguments)
+            result = evaluate(latest, args.task, queries=validation)
+            run.log({f"eval/{name}": result[name] for name in RESULTS})
+            bare = evaluate(latest, args.task, queries=validation, safety_filter=False)
+            run.log({f"eval/{name}_without_filter": bare[name] for name in RESULTS})
+            if args.capture_video:
+                images = first_episode_images(latest, args.task, 40, queries=validation)
+                run.log_video("eval/episode", images)
+            run.interruptible = False
+            progress["evaluated"] = run.step
+            if result["success_rate"] >= progress["best"]:
+                progress |= {"best": result["success_rate"], "best_step": run.step}
+                os.replace(latest, run.folder / "policy.onnx")
+        if run.step >= args.total_updates:
+            break
+
         # ALGO LOGIC: learn, while the next examples are drawn
         remaining = 1.0 - run.step / args.total_updates if args.anneal else 1.0
-        learning_rate = args.learning_rate * remaining
-        cuda_graphs.set_learning_rate(optimizer, learning_rate)
+        set_learning_rate(optimizer, args.learning_rate * remaining)
         batch = sample(pool, args.batch_size)
         if visited and len(visited["scene"]):
             weight = args.round_weight * len(visited["scene"])
@@ -368,29 +436,26 @@ if __name__ == "__main__":
             batch = {name: tensor[: args.batch_size] for name, tensor in batch.items()}
         scenes = latents[batch.pop("scene")]
         batch["observation"] = torch.cat([batch["observation"], scenes], dim=1)
-        losses = learn(batch, args.length_weight)
+        losses = learn(batch)
         polyak_update(actor_average, actor, args.policy_average)
         oldest = run.step % num_draws * args.examples_per_update
         for name, tensor in on_device(next(draws), device).items():
             pool[name][oldest : oldest + len(tensor)] = tensor
-        step = run.advance()
-        if step % 100 == 0:
-            run.log(losses | {"charts/learning_rate": learning_rate, "charts/SPS": int(run.rate)})
+        run.advance()
+        if time.monotonic() - logged > LOG_SECONDS or run.step == 1:
+            logged = time.monotonic()
+            run.log(losses | {"charts/learning_rate": args.learning_rate * remaining})
+            run.log({"charts/SPS": run.rate})
 
         # ALGO LOGIC: a round of DAgger
-        if args.round_every and step % args.round_every == 0 and step < args.total_updates:
-            # (The first environment renders, and is slower to change its scene.)
+        if args.round_every and run.step % args.round_every == 0 and run.step < args.total_updates:
             new, reached = dagger_round(
-                actor_average, eval_envs[-1], safety_filter, examples, args, step, device
+                actor_average, env, safety_filter, examples, args, run.step, device
             )
-            visited |= concat([visited, new]) if visited else new
+            if new:
+                visited |= concat([visited, new]) if visited else new
             run.log({"charts/round_success": reached})
-
-        # Evaluate, save the best policy, checkpoint
-        evaluating = step % args.eval_every == 0 or step == args.total_updates
-        if evaluating and run.validate(actor_average):
-            run.save_policy(actor_average)
-        if evaluating or run.interrupted:
-            run.checkpoint()
+        if run.interrupted:
+            run.save()
     draws.close()
-    run.final_test(test)
+    finish(run, test, progress["best"], progress["best_step"])

@@ -45,6 +45,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 from PIL import Image
 
 from roboarm_nmp.evaluation.report import report
@@ -140,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 check_writable(path)
         # Here, so that neither --help nor these errors wait for PyTorch.
         from roboarm_nmp.envs.perception.noise import SensorNoise
-        from roboarm_nmp.evaluation.evaluate import evaluate, first_episode_image
+        from roboarm_nmp.evaluation.evaluate import evaluate, first_episode_images
 
         options = dict(vars(args))
         for name in ("json", "image", *FILTER_FLAGS):
@@ -159,7 +160,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             write_atomically(args.json, (json.dumps(result, indent=2) + "\n").encode())
         if args.image is not None:
             png = io.BytesIO()
-            Image.fromarray(first_episode_image(**options)).save(png, format="PNG")
+            strip = np.hstack(first_episode_images(**options))
+            Image.fromarray(strip).save(png, format="PNG")
             write_atomically(args.image, png.getvalue())
     except OSError as error:
         print(error_line(f"cannot write: {error}"), file=sys.stderr)

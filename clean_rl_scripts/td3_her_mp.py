@@ -9,34 +9,95 @@ paper's sections 2 and 5. For an algorithm of your own, copy this file and chang
 `# ALGO LOGIC`. Parts between `# SHARED` and `# END SHARED` are the same in `sac_her_mp.py`.
 """
 
-from dataclasses import dataclass
+import functools
+import os
+import time
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
 import torch.nn as nn
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
-from roboarm_nmp.datasets.episodes import demo_transitions
-from roboarm_nmp.training import cuda_graphs, protocol, runs
-from roboarm_nmp.training.network_parts import (
-    Bf16Linear,
-    JacobianTranspose,
-    pose_difference,
-)
+import roboarm_nmp
+from roboarm_nmp.datasets.episodes import DemoQueriesWrapper, demo_transitions, load_demos_for
+from roboarm_nmp.envs.subgoals import MAX_STEP
+from roboarm_nmp.envs.tasks import task_name
+from roboarm_nmp.evaluation.evaluate import evaluate, first_episode_images
+from roboarm_nmp.policies.export import save_policy
+from roboarm_nmp.training.arguments import errors_of, fail, parse_args
+from roboarm_nmp.training.cuda_graphs import adam, graphed, to_device
+from roboarm_nmp.training.final_test import RESULTS, finish, load_task
+from roboarm_nmp.training.network_parts import Bf16Linear, GoalFeatures
+from roboarm_nmp.training.runs import Run, check_finite, script_name, seed_torch
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.progress import progress_bar
+from roboarm_nmp.utils.workers import starting_processes
+
+
+# SHARED: flags of the run
+@dataclass
+class RunArgs:
+    task: str = "no_obstacles"
+    """a task of `roboarm_nmp.TASKS` or a scene file; with another arm TASK@FILE, a robot's file"""
+    seed: flags.Seed = 1
+    """seed of all random numbers; runs with the same seed, machine and device are identical"""
+    eval_queries: flags.PositiveInt = 200
+    """validation queries per evaluation; the best policy is saved"""
+    test_queries: flags.NonNegativeInt = 1_000
+    """test queries for the best policy at the end (0: no test)"""
+    capture_video: bool = False
+    """a video of the first validation query per evaluation, in TensorBoard and as a file"""
+    runs_dir: Path = Path("runs")
+    """parent of the run's folder: TensorBoard events, checkpoint, `policy.onnx`, result.json"""
+    resume: Path | None = None
+    """continue the run in this folder from its last checkpoint, with its flags"""
+    device: str = "cpu"
+    """`cpu`, `cuda` or one of several, `cuda:1`"""
+    track: bool = False
+    """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
+
+
+# END SHARED
+
+
+# SHARED: flags of the environment
+@dataclass
+class EnvArgs:
+    goal_type: Literal["ee", "config", "combined", "pose"] = "ee"
+    """what the goal is: end-effector position, configuration, both, or end-effector pose"""
+    action_mode: Literal["relative", "subgoal"] = "relative"
+    """action: a displacement of the normalised configuration, or the next one itself"""
+    velocities: bool = False
+    """joint velocities in the observation"""
+    encoder: str | None = None
+    """the encoded scene in the observation: latent code (`vae`, `vqvae`, `pointnet2`, `field`, or
+    the path of your own `encoder.onnx`), `point_cloud`, or `oracle` (ground-truth obstacles)"""
+    geometry_source: str | None = None
+    """where link distances take the obstacles from: `ground_truth`, `point_cloud`, or an encoder
+    with a decoder (`field`, or a path), which also gives the points of the encoder `point_cloud`"""
+    link_distances: bool = False
+    """signed distance of each link from the nearest obstacle of --geometry-source, and its
+    gradient, in the observation"""
+
+
+# END SHARED
 
 
 @dataclass
-class Args(protocol.PolicyFlags, protocol.EnvFlags):
-    # More flags: `roboarm_nmp.training.protocol` (task, MDP), `roboarm_nmp.training.runs` (run).
+class Args(RunArgs, EnvArgs):
     num_envs: flags.Environments = 4
     """environments stepped together; every one of their steps counts"""
     total_timesteps: flags.PositiveInt = 1_000_000
     """environment steps of the whole run"""
     learning_starts: flags.NonNegativeInt = 2_000
     """environment steps with random actions before the first update"""
+    horizon: flags.Horizon = 400
+    """steps after which an episode of the training is truncated"""
+    stop_on_collision: bool = False
+    """end an episode of the training at the first contact"""
     updates_per_step: flags.NonNegativeFloat = 0.5
     """updates of the critics per environment step (CleanRL: 1)"""
     batch_size: flags.PositiveInt = 256
@@ -52,24 +113,17 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     """demonstration files of the task, to use with --demo-prob; by default the task's own"""
     bc_weight: flags.NonNegativeFloat = 0.0
     """with --demo-prob, weight of behavioural cloning in the policy's loss: the squared difference
-    from demonstrated actions, in units of the action scale (Fujimoto and Gu, 2021). Measured: 5, on
-    double_walls"""
-    demo_batch_size: flags.PositiveInt = 128
-    """transitions of demonstrations in every batch, besides the others, with --bc-weight"""
+    from demonstrated actions, in units of the action scale (Fujimoto and Gu, 2021)"""
     gamma: flags.Share | Literal["auto"] = "auto"
     """discount factor (CleanRL: 0.99); `auto`: 0.95, and 0.98 for arms with a joint that turns all
     the way round, as an arm at its limit may have to"""
     tau: flags.PositiveShare = 0.005
     """share of policy and critics that moves into the target networks, per update of the policy"""
-    policy_lr: flags.PositiveFloat = 1e-3
-    """learning rate of the policy (Adam; CleanRL: 3e-4)"""
-    q_lr: flags.PositiveFloat = 1e-3
-    """learning rate of the critics (Adam)"""
+    learning_rate: flags.PositiveFloat = 1e-3
+    """learning rate of all networks (Adam; CleanRL: 3e-4)"""
     exploration_noise: flags.NonNegativeFloat = 0.35
     """standard deviation of the noise on the actions in training, in units of the action scale
     (CleanRL: 0.1)"""
-    policy_frequency: flags.PositiveInt = 2
-    """updates of the critics per update of the policy and of all target networks"""
     preactivation_penalty: flags.NonNegativeFloat = 0.1
     """weight of the squared inputs of the policy's tanh in its loss, which keeps it from saturating
     (Andrychowicz et al., 2017, appendix A; CleanRL: 0)"""
@@ -80,14 +134,13 @@ class Args(protocol.PolicyFlags, protocol.EnvFlags):
     num_hidden_layers: flags.Layers = 2
     """number of hidden layers of policy and critics"""
     jacobian: bool = True
-    """network inputs: how the joints move the end effector straight to the goal (Jacobian); without
-    effect where the goal is a configuration, and on plain networks"""
+    """network inputs: how the joints move the end effector straight to the goal (Jacobian)"""
     plain_networks: bool = False
-    """CleanRL's networks: raw inputs, no LayerNorm, actions in [-1, 1] (not twice `max_step`)"""
+    """CleanRL's networks: raw inputs, no LayerNorm, actions in [-1, 1] (not in twice the step)"""
     bf16: bool | None = None
     """train with hidden layers in bfloat16; by default where the hardware has it"""
     eval_every: flags.PositiveInt = 25_000
-    """environment steps between evaluations on validation queries; the best policy is saved"""
+    """environment steps between evaluations on validation queries"""
     stop_at_success: flags.Share | None = None
     """stop at this success rate on validation queries, e.g. 0.9; by default never"""
 
@@ -121,60 +174,11 @@ def mlp(num_inputs, num_outputs, args, layer_norm=False):
 # END SHARED
 
 
-# SHARED: features and critics
-class Features(nn.Module):
-    """Network inputs: observation, goal and, unless plain, functions of them that ease learning."""
-
-    def __init__(self, args, env):
-        super().__init__()
-        self.plain = args.plain_networks
-        self.goal_type = args.goal_type
-        robot = env.unwrapped.robot
-        self.num_joints = robot.num_joints
-        self.jacobian = None
-        if args.jacobian and not self.plain and self.goal_type != "config":
-            self.jacobian = JacobianTranspose(robot, rotates=self.goal_type == "pose")
-        low, high = torch.tensor(robot.lower), torch.tensor(robot.upper)
-        self.register_buffer("middle", ((high + low) / 2).float())
-        self.register_buffer("half_range", ((high - low) / 2).float())
-        # The configuration, velocities (or not) and the end effector's position or pose.
-        first = 2 * self.num_joints if args.velocities else self.num_joints
-        end = env.unwrapped.observation_space["observation"].shape[0]
-        self.ee = slice(first, end)
-        # Link distances follow; the first number of each link is the distance.
-        links, numbers = robot.link_distances_shape
-        near = slice(end, end + links * numbers, numbers)
-        self.distances = near if args.link_distances else None
-        observation = torch.zeros(1, *env.observation_space["observation"].shape)
-        goal = torch.zeros(1, *env.observation_space["desired_goal"].shape)
-        self.size = self(observation, goal).shape[1]
-
-    def forward(self, observation, desired_goal):
-        """(N, o), (N, g) -> (N, size)."""
-        inputs = [observation, desired_goal]
-        if not self.plain:
-            joints = self.num_joints
-            angles = observation[:, :joints] * self.half_range + self.middle
-            inputs += [torch.sin(angles), torch.cos(angles)]
-            if self.goal_type == "pose":
-                inputs.append(5.0 * pose_difference(observation[:, self.ee], desired_goal))
-            if self.goal_type in ("ee", "combined"):
-                inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, self.ee]))
-            if self.jacobian is not None:
-                position = observation[:, self.ee][:, :3]
-                towards = self.jacobian(observation[:, :joints], position, inputs[-1])
-                inputs += [towards, towards / (towards.norm(dim=1, keepdim=True) + 1e-6)]
-            if self.goal_type in ("config", "combined"):
-                inputs.append(5.0 * (desired_goal[:, :joints] - observation[:, :joints]))
-        if self.distances is not None:
-            inputs.append(10.0 * observation[:, self.distances])  # they are small numbers
-        return torch.cat(inputs, dim=1)
-
-
+# SHARED: critics
 def action_scale(args):
     """The policy's actions are in [-scale, scale]."""
     is_plain = args.plain_networks or args.action_mode == "subgoal"
-    return 1.0 if is_plain else 2.0 * args.max_step
+    return 1.0 if is_plain else 2.0 * MAX_STEP
 
 
 class Critics(nn.Module):
@@ -199,7 +203,7 @@ class Critics(nn.Module):
 class Actor(nn.Module):
     def __init__(self, args, env):
         super().__init__()
-        self.features = Features(args, env)
+        self.features = GoalFeatures(env, args.plain_networks, args.jacobian)
         self.action_scale = action_scale(args)
         self.mlp = mlp(self.features.size, self.features.num_joints, args)
 
@@ -226,7 +230,7 @@ class HerReplayBuffer:
     end of an observation is stored once: `latents[latent]`; of the next one `latents[next_latent]`.
     """
 
-    def __init__(self, env, capacity, her_probability, rng, her_exponent=1.0):
+    def __init__(self, env, capacity, args, rng):
         spaces = env.observation_space
         encoder = getattr(env, "encoder", None)
         latent_size = 0 if encoder is None else encoder.size
@@ -249,16 +253,41 @@ class HerReplayBuffer:
         self.latent_numbers = {}
         self.env = env.unwrapped
         self.capacity = capacity
+        self.args = args
         self.rng = rng
-        self.her_probability = her_probability
-        self.her_exponent = her_exponent
+        self.running = [[] for _ in range(args.num_envs)]  # the episodes that have not ended
         self.position = 0
         self.size = 0
+
+    def add(self, observations, actions, next_observations, collisions, ended):
+        """A step of all environments: dicts of arrays (num_envs, ...), and arrays (num_envs, ...).
+
+        `next_observations` are those of the same episodes, also where an episode has `ended`.
+        """
+        step = {
+            "observation": observations["observation"],
+            "action": actions,
+            "next_observation": next_observations["observation"],
+            "next_achieved_goal": next_observations["achieved_goal"],
+            "desired_goal": observations["desired_goal"],
+            "collision": collisions,
+        }
+        for i, episode in enumerate(self.running):
+            episode.append({name: array[i] for name, array in step.items()})
+            if ended[i]:
+                self.add_episode(episode)
+                self.running[i] = []
+
+    def end_episodes(self):
+        """The running episodes end as they are."""
+        for episode in self.running:
+            self.add_episode(episode)
+        self.running = [[] for _ in self.running]
 
     def add_episode(self, transitions):
         """`transitions`: a list of dicts with the float arrays' names as keys."""
         index = (self.position + np.arange(len(transitions))) % self.capacity
-        for name in transitions[0]:
+        for name in transitions[0] if transitions else ():
             width = self.arrays[name].shape[1]  # an observation's is without the latent
             values = np.stack([np.atleast_1d(transition[name]) for transition in transitions])
             self.arrays[name][index] = values[:, :width]
@@ -282,9 +311,9 @@ class HerReplayBuffer:
         """A dict of float32 arrays (batch_size, ...); `reward` and `terminated` (batch_size,)."""
         index = self.rng.integers(self.size, size=batch_size)
         data = {name: array[index] for name, array in self.arrays.items()}
-        later = self.rng.random(batch_size) ** self.her_exponent * (data.pop("remaining") + 1)
+        later = self.rng.random(batch_size) ** self.args.her_exponent * (data.pop("remaining") + 1)
         later = (index + later.astype(np.int64)) % self.capacity
-        relabel = self.rng.random(batch_size) < self.her_probability
+        relabel = self.rng.random(batch_size) < self.args.her_probability
         hindsight_goal = self.arrays["next_achieved_goal"][later]
         data["desired_goal"] = np.where(relabel[:, None], hindsight_goal, data["desired_goal"])
         achieved, desired = data["next_achieved_goal"], data["desired_goal"]
@@ -300,7 +329,7 @@ class HerReplayBuffer:
         """Yield `number` batches, dicts of tensors; up to 64 are sampled together, for speed."""
         for first in range(0, number, 64):
             data = self.sample(min(64, number - first) * batch_size)
-            parts = [cuda_graphs.to_device(a, device).split(batch_size) for a in data.values()]
+            parts = [to_device(array, device).split(batch_size) for array in data.values()]
             for tensors in zip(*parts, strict=True):
                 yield dict(zip(data, tensors, strict=True))
 
@@ -318,21 +347,21 @@ class HerReplayBuffer:
             self.latent_number(latent)
 
 
-def buffer_of_demos(demos, env, args, rng):
-    """A `HerReplayBuffer` with all transitions of `Demos`, as `env` would have recorded them."""
-    size = int(demos.offsets[-1])
-    buffer = HerReplayBuffer(env, size, args.her_probability, rng, args.her_exponent)
-    if args.encoder is not None:
-        env.encoder.encode_demos(demos)  # the environments may have done so in other processes
-    for demo in progress_bar(demos, "demonstrations", unit="demonstration", transient=True):
-        buffer.add_episode(demo_transitions(demo, env))
-    return buffer
+# END SHARED
 
 
-def concat(batches, more):
-    """Yield each batch with the rows of the next one of `more` after its own."""
-    for batch, rows in zip(batches, more, strict=True):
-        yield {name: torch.cat([value, rows[name]]) for name, value in batch.items()}
+# SHARED: environments
+def env_arguments(args):
+    """The arguments of `roboarm_nmp.make` that a policy is saved with."""
+    arguments = {field.name: getattr(args, field.name) for field in fields(EnvArgs)}
+    return arguments | {"append_link_distances": args.link_distances}
+
+
+def make_env(args, demos=None):
+    """An environment; with demonstrations, its episodes are their queries."""
+    rules = {"horizon": args.horizon, "stop_on_collision": args.stop_on_collision}
+    env = roboarm_nmp.make(args.task, **env_arguments(args), **rules)
+    return env if demos is None else DemoQueriesWrapper(env, demos)
 
 
 def updates_due(step, args):
@@ -340,6 +369,16 @@ def updates_due(step, args):
     begin = max(0, step - args.num_envs - args.learning_starts)
     end = max(0, step - args.learning_starts)
     return int(end * args.updates_per_step) - int(begin * args.updates_per_step)
+
+
+def reset_seeds(args, step):
+    """The seeds of the environments' episodes that begin at a step of the run."""
+    return np.random.SeedSequence([args.seed, step]).generate_state(args.num_envs).tolist()
+
+
+def concat(batch, more):
+    """A batch with the rows of another after its own."""
+    return {name: torch.cat([value, more[name]]) for name, value in batch.items()}
 
 
 WHOLE_TURN = 6.28  # rad
@@ -355,7 +394,10 @@ def discount_factor(gamma, robot):
 # END SHARED
 
 
-# ALGO LOGIC: networks, optimisers and one update
+# ALGO LOGIC: networks, optimisers and updates
+LOG_SECONDS = 10  # between two logs of the losses
+DEMO_BATCH_SIZE = 128  # transitions of demonstrations in every batch, with --bc-weight
+POLICY_FREQUENCY = 2  # updates of the critics per update of the policy and of all target networks
 POLICY_NOISE, NOISE_CLIP = 0.2, 0.5  # of the critics' target, in units of the action scale
 
 
@@ -371,144 +413,197 @@ class TD3:
         self.critics = Critics(args, self.actor.features).to(device)
         self.critics_target = Critics(args, self.actor.features).to(device)
         self.critics_target.load_state_dict(self.critics.state_dict())
-        parameters = self.actor.parameters()
-        self.actor_optimizer = cuda_graphs.adam(parameters, args.policy_lr, args, device)
-        self.q_optimizer = cuda_graphs.adam(self.critics.parameters(), args.q_lr, args, device)
-
-    def checkpoint_state(self):
-        """The parts of a checkpoint, by name."""
-        constants = ("args", "gamma")
-        return {name: part for name, part in vars(self).items() if name not in constants}
+        self.actor_optimizer = adam(self.actor.parameters(), args.learning_rate, device)
+        self.q_optimizer = adam(self.critics.parameters(), args.learning_rate, device)
+        self.state = {
+            "actor": self.actor,
+            "actor_target": self.actor_target,
+            "actor_average": self.actor_average,
+            "critics": self.critics,
+            "critics_target": self.critics_target,
+            "actor_optimizer": self.actor_optimizer,
+            "q_optimizer": self.q_optimizer,
+        }
 
     @torch.no_grad()
     def explore(self, data):
         """From observations, (N, ...) each, to a dict with noisy `actions` (N, n)."""
         self.actor.eval()
         actions = self.actor(**data)
-        scale = self.actor.action_scale
         self.actor.train()
+        scale = self.actor.action_scale
         noise = self.args.exploration_noise * torch.randn_like(actions)
         return {"actions": (actions + scale * noise).clamp(-scale, scale)}
 
-    def update(self, data, of_policy):
-        """An update on a batch, `of_policy` or not. Returns tensors whose means are logged."""
-        args, scale = self.args, self.actor.action_scale
-        both = torch.cat([data["observation"], data["next_observation"]])
-        features = self.actor.features(both, data["desired_goal"].repeat(2, 1))
-        features, next_features = features.chunk(2)
+    def update_critics(self, data):
+        """A step of the critics on a batch. Returns tensors whose means are logged."""
+        scale = self.actor.action_scale
+        features = self.actor.features(data["observation"], data["desired_goal"])
         with torch.no_grad():
+            next_features = self.actor.features(data["next_observation"], data["desired_goal"])
             next_actions, _ = self.actor_target.get_action(next_features)
             clipped_noise = POLICY_NOISE * torch.randn_like(next_actions)
             clipped_noise = clipped_noise.clamp(-NOISE_CLIP, NOISE_CLIP)
             next_actions = (next_actions + scale * clipped_noise).clamp(-scale, scale)
-            min_qf_next_target = self.critics_target(next_features, next_actions).amin(0)
-            not_terminated = 1.0 - data["terminated"]
-            next_q_value = data["reward"] + self.gamma * not_terminated * min_qf_next_target
+            next_value = self.critics_target(next_features, next_actions).amin(0)
+            # An episode that was truncated, not terminated, would have gone on: its value counts.
+            next_q_value = data["reward"] + self.gamma * (1.0 - data["terminated"]) * next_value
         qf_values = self.critics(features, data["action"])
         qf_losses = (qf_values - next_q_value).square().mean(1)  # of Q1 and of Q2
         self.q_optimizer.zero_grad()
         qf_losses.sum().backward()
         self.q_optimizer.step()
-        losses = {
-            "qf1_values": qf_values[0],
-            "qf2_values": qf_values[1],
-            "qf1_loss": qf_losses[0],
-            "qf2_loss": qf_losses[1],
-            "qf_loss": qf_losses,
-        }
+        return {"qf1_values": qf_values[0], "qf_loss": qf_losses}
 
-        if of_policy:
-            self.critics.requires_grad_(False)  # they need no gradient of the policy's loss
-            actions, preactivation = self.actor.get_action(features)
-            qf1 = self.critics(features, actions, number=1)
-            penalty = args.preactivation_penalty * preactivation.square().mean()
-            actor_loss = penalty - qf1.mean()
-            if args.bc_weight > 0:  # the last transitions are those of demonstrations
-                difference = (actions - data["action"])[-args.demo_batch_size :]
-                bc_loss = (difference / scale).square().sum(1).mean()
-                actor_loss = actor_loss + args.bc_weight * bc_loss
-                losses["bc_loss"] = bc_loss
-            self.actor_optimizer.zero_grad()
-            actor_loss.backward()
-            self.actor_optimizer.step()
-            self.critics.requires_grad_(True)
-            polyak_update(self.actor_average, self.actor, args.policy_average)
-            polyak_update(self.actor_target, self.actor, args.tau)
-            polyak_update(self.critics_target, self.critics, args.tau)
-            losses["actor_loss"] = actor_loss
-            losses["preactivation"] = preactivation.abs()
-        return losses
+    def update_actor(self, data):
+        """A step of the policy and of all target networks. Returns tensors to log."""
+        args = self.args
+        features = self.actor.features(data["observation"], data["desired_goal"])
+        self.critics.requires_grad_(False)  # they need no gradient of the policy's loss
+        actions, preactivation = self.actor.get_action(features)
+        penalty = args.preactivation_penalty * preactivation.square().mean()
+        actor_loss = penalty - self.critics(features, actions, number=1).mean()
+        losses = {}
+        if args.bc_weight > 0:  # the last transitions are those of demonstrations
+            difference = (actions - data["action"])[-DEMO_BATCH_SIZE:]
+            losses["bc_loss"] = (difference / self.actor.action_scale).square().sum(1).mean()
+            actor_loss = actor_loss + args.bc_weight * losses["bc_loss"]
+        self.actor_optimizer.zero_grad()
+        actor_loss.backward()
+        self.actor_optimizer.step()
+        self.critics.requires_grad_(True)
+        polyak_update(self.actor_average, self.actor, args.policy_average)
+        polyak_update(self.actor_target, self.actor, args.tau)
+        polyak_update(self.critics_target, self.critics, args.tau)
+        return losses | {"actor_loss": actor_loss, "preactivation": preactivation.abs()}
 
 
 if __name__ == "__main__":
-    # SHARED: checks and environments
-    args = runs.parse_args(Args, may_change={"total_timesteps", "test_queries", "stop_at_success"})
-    device = runs.seed_torch(args)
-    validation, test = protocol.load_task(args)
-    env_arguments = protocol.env_arguments_of(args)
-    envs = protocol.make_training_envs(args, args.demo_prob, args.demos, args.bc_weight)
-    eval_envs = protocol.make_eval_envs(args.task, len(validation), **env_arguments)
+    # SHARED: checks, environments
+    args = parse_args(Args, may_change={"total_timesteps", "test_queries", "stop_at_success"})
+    device = seed_torch(args)
+    validation, test = load_task(args)
+    if args.demo_prob is None and (args.demos or args.bc_weight > 0):
+        fail("--demos and --bc-weight go with --demo-prob")
+    with errors_of("--encoder, --geometry-source, --link-distances"):
+        env = make_env(args)  # for its spaces and rewards
+    demos = None
+    if args.demo_prob is not None:
+        with errors_of("--demo-prob"):
+            demos = load_demos_for(env, args.demos, args.task)
     # END SHARED
 
-    agent = TD3(args, eval_envs[0], device)
-    # SHARED: run and episodes
-    explore = cuda_graphs.graphed(agent.explore, args, device)
-    update = cuda_graphs.graphed(agent.update, args, device)
+    agent = TD3(args, env, device)
+    # SHARED: run, buffers, episodes
+    explore = graphed(agent.explore, device)
+    update_critics = graphed(agent.update_critics, device)
+    update_actor = graphed(agent.update_actor, device)
     rng = np.random.default_rng(args.seed)
-    buffer = HerReplayBuffer(
-        eval_envs[0], BUFFER_SIZE, args.her_probability, rng, args.her_exponent
-    )
-    counts = {"updates": 0, "demos_injected": 0}
-    losses = {}
-    state = agent.checkpoint_state() | {"buffer": buffer, "rng": rng, "counts": counts}
-    run = protocol.PolicyRun(args, state, device, env_arguments, eval_envs, validation)
-    envs.encode_demos()
-    run.start(args.total_timesteps, "step")
+    buffer = HerReplayBuffer(env, BUFFER_SIZE, args, rng)
+    progress = {"updates": 0, "demos_injected": 0, "evaluated": 0, "best": -1.0, "best_step": 0}
+    state = agent.state | {"buffer": buffer, "rng": rng, "progress": progress}
+    run = Run(args, task_name(args.task), state)
+    makers = [functools.partial(make_env, args, demos)] * args.num_envs
+    if device.type == "cuda":  # it would wait for the environments; a CPU computes longer than they
+        with starting_processes():
+            envs = AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.SAME_STEP)
+    else:
+        envs = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
     demo_buffer = None
     if args.bc_weight > 0:
-        demo_buffer = buffer_of_demos(envs.demos, eval_envs[0], args, rng)
-    envs.begin_episodes(args.seed, run.step)
-    run.repeat_evaluation(agent.actor_average)
+        demo_buffer = HerReplayBuffer(env, int(demos.offsets[-1]), args, rng)
+        for demo in progress_bar(demos, "demonstrations", transient=True):
+            demo_buffer.add_episode(demo_transitions(demo, env))
+    observations, infos = envs.reset(seed=reset_seeds(args, run.step))
+    demo_numbers = infos.get("demo")
+    returns = np.zeros(args.num_envs)
+    losses = {}
+    logged = 0.0
+    run.start(args.total_timesteps, "step")
     # END SHARED
 
-    while run.step < args.total_timesteps and not run.reached(args.stop_at_success):
+    while True:
+        # SHARED: evaluate, keep the best policy
+        due = run.step % args.eval_every < args.num_envs or run.step >= args.total_timesteps
+        if due and run.step > progress["evaluated"]:
+            buffer.end_episodes()  # new ones begin, here as in a run that is resumed
+            run.save()  # a run that is stopped while it evaluates repeats the evaluation
+            run.interruptible = True
+            latest = run.folder / "latest.onnx"
+            origin = {"script": script_name(), "seed": args.seed, "step": run.step}
+            save_policy(latest, agent.actor_average, args.task, None, origin, **env_arguments(args))
+            result = evaluate(latest, args.task, queries=validation)
+            run.log({f"eval/{name}": result[name] for name in RESULTS})
+            if args.capture_video:
+                images = first_episode_images(latest, args.task, 40, queries=validation)
+                run.log_video("eval/episode", images)
+            run.interruptible = False
+            progress["evaluated"] = run.step
+            if result["success_rate"] >= progress["best"]:
+                progress |= {"best": result["success_rate"], "best_step": run.step}
+                os.replace(latest, run.folder / "policy.onnx")
+            observations, infos = envs.reset(seed=reset_seeds(args, run.step))
+            demo_numbers = infos.get("demo")
+            returns[:] = 0.0
+        reached = args.stop_at_success is not None and progress["best"] >= args.stop_at_success
+        if run.step >= args.total_timesteps or reached:
+            break
+        # END SHARED
+
         # ALGO LOGIC: act
         if run.step < args.learning_starts:
-            actions = 2 * torch.rand(args.num_envs, *eval_envs[0].action_space.shape) - 1
+            actions = 2 * torch.rand(args.num_envs, env.action_space.shape[0]) - 1
             actions = actions.numpy() * agent.actor.action_scale
         else:
-            actions = explore(protocol.stack(envs.observations, device))["actions"].cpu().numpy()
+            on_device = {name: to_device(array, device) for name, array in observations.items()}
+            actions = explore(on_device)["actions"].cpu().numpy()
 
         # SHARED: a step in every environment
-        runs.check_finite("the policy's actions", actions)
-        for episode in envs.step(actions):
-            buffer.add_episode(episode.transitions)
-            if episode.demo is not None:
-                buffer.add_episode(episode.demo)
-                counts["demos_injected"] += 1
-            run.log_episode(episode, counts["demos_injected"] if args.demo_prob else None)
-        global_step = run.advance(args.num_envs)
+        check_finite("the policy's actions", actions)
+        next_observations, rewards, terminated, truncated, infos = envs.step(actions)
+        run.advance(args.num_envs)
+        # Where an episode has ended, the next one has begun: what the last step led to is in infos.
+        ended = terminated | truncated
+        reached_observations = {name: array.copy() for name, array in next_observations.items()}
+        collisions = infos["collision"].copy()
+        for i in np.flatnonzero(ended):
+            collisions[i] = infos["final_info"]["collision"][i]
+            for name, array in reached_observations.items():
+                array[i] = infos["final_obs"][i][name]
+        buffer.add(observations, actions, reached_observations, collisions, ended)
+        returns += rewards
+        for i in np.flatnonzero(ended):
+            success = infos["final_info"]["is_success"][i]
+            if demos is not None and not success and rng.random() < args.demo_prob:
+                buffer.add_episode(demo_transitions(demos[int(demo_numbers[i])], env))
+                progress["demos_injected"] += 1
+            steps = infos["final_info"]["elapsed_steps"][i]
+            episode = {"episodic_return": returns[i], "episodic_length": steps, "success": success}
+            run.log({f"charts/{name}": value for name, value in episode.items()})
+            returns[i] = 0.0
+        if demos is not None and ended.any():
+            demo_numbers = np.where(ended, infos["demo"], demo_numbers)
+        observations = next_observations
+        # END SHARED
 
-        # ALGO LOGIC: learn
-        due = updates_due(global_step, args) if buffer.size > 0 else 0
-        batches = buffer.batches(due, args.batch_size, device)
+        # SHARED: learn
+        number = updates_due(run.step, args) if buffer.size > 0 else 0
+        batches = buffer.batches(number, args.batch_size, device)
         if demo_buffer is not None:
-            batches = concat(batches, demo_buffer.batches(due, args.demo_batch_size, device))
+            more = demo_buffer.batches(number, DEMO_BATCH_SIZE, device)
+            batches = map(concat, batches, more)
         for data in batches:
-            losses |= update(data, counts["updates"] % args.policy_frequency == 0)
-            counts["updates"] += 1
-            if counts["updates"] % 1000 == 0:
-                named = {f"losses/{name}": value for name, value in losses.items()}
-                run.log(named | {"charts/SPS": int(run.rate)})
-
-        # Evaluate, save the best policy, checkpoint
-        evaluating = run.step % args.eval_every < args.num_envs or run.step >= args.total_timesteps
-        if evaluating and run.validate(agent.actor_average):
-            run.save_policy(agent.actor_average)
-        if evaluating or run.interrupted:
-            # New episodes begin, in this run as in one that is resumed from the checkpoint.
-            for transitions in envs.begin_episodes(args.seed, run.step):
-                buffer.add_episode(transitions)
-            run.checkpoint()
-    run.final_test(test)
+            losses |= update_critics(data)
+            if progress["updates"] % POLICY_FREQUENCY == 0:
+                losses |= update_actor(data)
+            progress["updates"] += 1
+            if time.monotonic() - logged > LOG_SECONDS or progress["updates"] == 1:
+                logged = time.monotonic()
+                run.log({f"losses/{name}": value for name, value in losses.items()})
+                run.log({"charts/SPS": run.rate})
+        if run.interrupted:
+            buffer.end_episodes()
+            run.save()
+    envs.close()
+    finish(run, test, progress["best"], progress["best_step"])
     # END SHARED

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from roboarm_nmp.datasets.observations import Observations
 from roboarm_nmp.envs.perception.sensors import NOTHING, OBSTACLE, PointCloud, deproject
 from roboarm_nmp.scene_embedding_train.training_data import unpack
-from roboarm_nmp.training.runs import fail
+from roboarm_nmp.training.arguments import fail
 
 MAX_RADIUS = 1.1  # m from the robot's axis: the arm does not reach further
 TABLE_TOP = 0.01  # m: table and floor are most of a cloud, so points above it are sampled apart

@@ -49,7 +49,8 @@ from roboarm_nmp.scene_embedding_train.training_data import (
     load_observations,
     write_result,
 )
-from roboarm_nmp.training.runs import Run, check_finite, fail, parse_args, seed_torch
+from roboarm_nmp.training.arguments import fail, parse_args
+from roboarm_nmp.training.runs import Run, check_finite, seed_torch
 from roboarm_nmp.utils.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Width
 
 # The field is around the robot's axis, m.
@@ -61,7 +62,7 @@ SECTORS = 8
 
 
 @dataclass
-class Args(EncoderFlags):  # whose flags are in `training_data.py` and `roboarm_nmp.training.runs`
+class Args(EncoderFlags):  # whose flags are in `training_data.py`
     # The algorithm
     total_updates: PositiveInt = 20_000
     """batches of the whole run"""
@@ -331,7 +332,9 @@ if __name__ == "__main__":
         obstacles = torch.as_tensor(data[-1][validation])
         queries = sample_queries(obstacles, 4 * args.num_query_points, args.spread)
 
-    run = Run(args, observations.task, {"model": model, "optimizer": optimizer, "rng": rng}, device)
+    best: dict[str, float] = {"step": 0}  # the best evaluation
+    state = {"model": model, "optimizer": optimizer, "rng": rng, "best": best}
+    run = Run(args, observations.task, state)
     run.start(args.total_updates, "update")
 
     while run.step < args.total_updates:
@@ -340,7 +343,8 @@ if __name__ == "__main__":
         optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         batch = batch_of(data, rng.integers(num_training, size=args.batch_size), device)
         losses = update(model, optimizer, batch, args)
-        step = run.advance()
+        run.advance()
+        step = run.step
         if step % 100 == 0:
             run.log({f"losses/{name}": value for name, value in losses.items()})
             run.log({"charts/updates_per_second": run.rate})
@@ -355,7 +359,8 @@ if __name__ == "__main__":
             field = functools.partial(model, points, valid)
             run.log_image("eval/slices", comparison(obstacles, field, REACH))
             run.show(validation_error_near=f"{result['error_near']:.4f}")
-            if run.is_best(-result["error_near"], result):
+            if result["error_near"] <= best.get("error_near", math.inf):
+                best.update(result, step=step)
                 encoder = ExportedEncoder(model, tuple(names), args.num_points)
                 details = metadata | {"step": step} | result
                 save_network(run.folder / "encoder.onnx", encoder, example, details, ["latent"])
@@ -370,10 +375,10 @@ if __name__ == "__main__":
                     variable_axes={"points": [1]},
                 )
         if evaluating or run.interrupted:
-            run.checkpoint()
+            run.save()
     run.close()
 
-    result = write_result(run, num_training)
+    result = write_result(run, best, num_training)
     summary = "mean error {error_near:.4f} m within 10 cm of an obstacle; up to 5 cm "
     summary += "{error_5cm:.4f}, 10 cm {error_10cm:.4f}, 20 cm {error_20cm:.4f}, "
     summary += "40 cm {error_40cm:.4f}"

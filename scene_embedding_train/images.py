@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from roboarm_nmp.datasets.observations import Observations
 from roboarm_nmp.envs.perception.sensors import Camera
 from roboarm_nmp.scene_embedding_train.training_data import unpack
-from roboarm_nmp.training.runs import fail
+from roboarm_nmp.training.arguments import fail
 
 
 def load_images(observations: Observations, size: int) -> tuple[np.ndarray, list[str]]:

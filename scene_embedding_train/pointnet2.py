@@ -42,7 +42,8 @@ from roboarm_nmp.scene_embedding_train.clouds import (
     scene_cloud,
     thin_out,
 )
-from roboarm_nmp.training.runs import Run, check_finite, fail, parse_args, seed_torch
+from roboarm_nmp.training.arguments import fail, parse_args
+from roboarm_nmp.training.runs import Run, check_finite, seed_torch
 from roboarm_nmp.utils.flags import PositiveFloat, PositiveInt, Width
 
 
@@ -265,7 +266,9 @@ if __name__ == "__main__":
     shown, classes = scene_cloud(observations, validation[0], next(iter(clouds.sensors)))
     shown = shown.to(device).unsqueeze(0)
 
-    run = Run(args, observations.task, {"model": model, "optimizer": optimizer, "rng": rng}, device)
+    best: dict[str, float] = {"step": 0}  # the best evaluation
+    state = {"model": model, "optimizer": optimizer, "rng": rng, "best": best}
+    run = Run(args, observations.task, state)
     run.start(args.total_updates, "update")
 
     while run.step < args.total_updates:
@@ -274,7 +277,8 @@ if __name__ == "__main__":
         optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         batch = batch_of(clouds, rng.integers(num_training, size=args.batch_size), device)
         loss = update(model, optimizer, batch, args)
-        step = run.advance()
+        run.advance()
+        step = run.step
         if step % 100 == 0:
             run.log({"losses/loss": loss, "charts/updates_per_second": run.rate})
 
@@ -291,15 +295,16 @@ if __name__ == "__main__":
             iou, absent = f"{result['iou_obstacle']:.3f}", f"{result['absent']:.3f}"
             run.show(validation_iou=iou, validation_absent=absent)
             error = 1 - (result["iou_obstacle"] + result["absent"]) / 2
-            if run.is_best(-error, result):
+            if error <= best.get("error", math.inf):
+                best.update(result, error=error, step=step)
                 encoder = ExportedEncoder(model, tuple(clouds.sensors))
                 details = metadata | {"step": step} | result
                 save_network(run.folder / "encoder.onnx", encoder, example, details, ["latent"])
         if evaluating or run.interrupted:
-            run.checkpoint()
+            run.save()
     run.close()
 
-    result = training_data.write_result(run, num_training)
+    result = training_data.write_result(run, best, num_training)
     summary = "accuracy {accuracy:.4f}; IoU robot {iou_robot:.3f}, table and floor "
     summary += "{iou_static:.3f}, obstacles {iou_obstacle:.3f}; absent points {absent:.3f}"
     print(f"{summary.format(**result)}. {run.folder / 'result.json'}")

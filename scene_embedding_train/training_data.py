@@ -17,16 +17,27 @@ from roboarm_nmp.envs.perception.sensors import sensors_to_json
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.robots.metadata import robot_metadata
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.training.runs import Run, RunFlags, errors_of, fail, script_name
+from roboarm_nmp.training.arguments import errors_of, fail
+from roboarm_nmp.training.runs import Run, script_name
 from roboarm_nmp.utils.files import new_contents
-from roboarm_nmp.utils.flags import PositiveInt, Share
+from roboarm_nmp.utils.flags import PositiveInt, Seed, Share
 from roboarm_nmp.utils.progress import progress_bar
 
 
 @dataclass
-class EncoderFlags(RunFlags):
-    """The flags of every encoder's trainer, in addition to those of its run."""
+class EncoderFlags:
+    """The flags of every encoder's trainer."""
 
+    seed: Seed = 1
+    """seed of all random numbers; runs with the same seed, machine and device are identical"""
+    runs_dir: Path = Path("runs")
+    """parent of the run's folder: TensorBoard events, checkpoint, `encoder.onnx`, result.json"""
+    resume: Path | None = None
+    """continue the run in this folder from its last checkpoint, with its flags"""
+    device: str = "cpu"
+    """`cpu`, `cuda` or one of several, `cuda:1`"""
+    track: bool = False
+    """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
     observations: Path = Path("observations")
     """folder that `roboarm observations` wrote"""
     robot: Path | None = None
@@ -76,19 +87,19 @@ def encoder_metadata(args: EncoderFlags, observations: Observations, names: Iter
     }
 
 
-def write_result(run: Run, num_training: int) -> dict:
+def write_result(run: Run, best: dict, num_training: int) -> dict:
     """Write `result.json`: the best evaluation and the size of the run. Returns its dict.
 
     Args:
-        run: the `Run`, whose `best_result` is a dict of the best evaluation.
+        run: the `Run`.
+        best: a dict with the best evaluation's numbers and its `step`.
         num_training: number of scenes that it trained on.
     """
-    result = {
-        **run.best_result,
+    result = {name: value for name, value in best.items() if name != "step"} | {
         "scenes": num_training,
         "encoder": str(run.folder / "encoder.onnx"),
         "updates": run.step,
-        "best_update": run.best_step,
+        "best_update": best["step"],
         "seconds": round(run.seconds),
     }
     run.write_result(result)

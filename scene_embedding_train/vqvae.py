@@ -11,6 +11,7 @@ own, copy this file and change the parts under `# MODEL`. Parts between `# SHARE
 `# END SHARED` are those of `vae.py`.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,12 +36,13 @@ from roboarm_nmp.scene_embedding_train.training_data import (
     load_observations,
     write_result,
 )
-from roboarm_nmp.training.runs import Run, fail, parse_args, seed_torch
+from roboarm_nmp.training.arguments import fail, parse_args
+from roboarm_nmp.training.runs import Run, seed_torch
 from roboarm_nmp.utils.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Width
 
 
 @dataclass
-class Args(EncoderFlags):  # whose flags are in `training_data.py` and `roboarm_nmp.training.runs`
+class Args(EncoderFlags):  # whose flags are in `training_data.py`
     # The algorithm
     total_updates: PositiveInt = 20_000
     """batches of the whole run"""
@@ -252,7 +254,9 @@ if __name__ == "__main__":
     # MODEL: network and optimiser
     model = VQVAE(len(cameras), size, args).to(device)
     optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, fused=True)
-    run = Run(args, observations.task, {"model": model, "optimizer": optimizer, "rng": rng}, device)
+    best: dict[str, float] = {"step": 0}  # the best evaluation
+    state = {"model": model, "optimizer": optimizer, "rng": rng, "best": best}
+    run = Run(args, observations.task, state)
     run.start(args.total_updates, "update")
 
     while run.step < args.total_updates:
@@ -261,7 +265,8 @@ if __name__ == "__main__":
         optimizer.param_groups[0]["lr"] = args.learning_rate * remaining
         batch = batch_of(images, rng.integers(num_training, size=args.batch_size), device)
         losses, latents = update(model, optimizer, batch, mean_image, args)
-        step = run.advance()
+        run.advance()
+        step = run.step
         if step % args.restart_every == 0:
             run.log({"charts/codes_used": model.restart_codes(latents)})
         if step % 100 == 0:
@@ -278,15 +283,16 @@ if __name__ == "__main__":
             figure = comparison(model, batch_of(images, validation[:1], device))
             run.log_image("eval/reconstruction", figure)
             run.show(validation_error=f"{result['error_foreground']:.4f}")
-            if run.is_best(-result["error_foreground"], result):
+            if result["error_foreground"] <= best.get("error_foreground", math.inf):
+                best.update(result, step=step)
                 encoder = ExportedEncoder(model, tuple(cameras), size)
                 details = metadata | {"step": step} | result
                 save_network(run.folder / "encoder.onnx", encoder, example, details, ["latent"])
         if evaluating or run.interrupted:
-            run.checkpoint()
+            run.save()
     run.close()
 
-    result = write_result(run, num_training)
+    result = write_result(run, best, num_training)
     summary = "error {error:.5f} (mean image {mean_image_error:.5f}); foreground "
     summary += "{error_foreground:.4f} ({mean_image_error_foreground:.4f})"
     print(f"{summary.format(**result)}. {run.folder / 'result.json'}")

@@ -128,11 +128,17 @@ def demo_transitions(demo: Demo, env: "RoboArmEnv") -> list[dict[str, Any]]:
 
 
 class DemoQueriesWrapper(gym.Wrapper):
-    """Episodes on the queries of demonstrations: `reset` draws one of them, `demo` is that `Demo`.
+    """Episodes on the queries of demonstrations: `reset` draws one of them.
+
+    Its number in `demos` is in `info["demo"]`. If the environment has an encoder, all scenes are
+    encoded first, which may take minutes.
 
     Args:
         env: an environment of `envs.make`.
         demos: the `Demos`.
+
+    Raises:
+        ValueError: the scenes cannot be encoded.
     """
 
     env: "RoboArmEnv"
@@ -140,7 +146,9 @@ class DemoQueriesWrapper(gym.Wrapper):
     def __init__(self, env: "RoboArmEnv", demos: Demos):
         super().__init__(env)
         self.demos = demos
-        self.demo: Demo | None = None
+        encoder = getattr(env, "encoder", None)
+        if encoder is not None:
+            encoder.encode_demos(demos)
 
     def reset(
         self, *, seed: int | None = None, options: dict | None = None
@@ -148,8 +156,10 @@ class DemoQueriesWrapper(gym.Wrapper):
         """As `RoboArmEnv.reset`."""
         if seed is not None:
             self.env.reset(seed=seed)
-        self.demo = self.demos[int(self.np_random.integers(len(self.demos)))]
-        return self.env.reset_specific(self.demo.start, self.demo.goal, self.demo.scene)
+        number = int(self.np_random.integers(len(self.demos)))
+        demo = self.demos[number]
+        observation, info = self.env.reset_specific(demo.start, demo.goal, demo.scene)
+        return observation, info | {"demo": number}
 
 
 def load_demos_for(env: "RoboArmEnv", files: Sequence[str | Path], task: str) -> Demos:

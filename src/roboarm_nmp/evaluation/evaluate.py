@@ -35,7 +35,7 @@ from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import get_task, task_name
-from roboarm_nmp.evaluation.rollout import REAL_TIME, render_strip, rollout
+from roboarm_nmp.evaluation.rollout import REAL_TIME, render_steps, rollout
 from roboarm_nmp.motions.metrics import motion_metrics, path_length, smoothness
 from roboarm_nmp.policies.baselines import (
     CHECKING,
@@ -198,21 +198,21 @@ def evaluate(
     return _summary(job, _run(job, progress))
 
 
-def first_episode_image(
-    policy: str | Path | Policy, task: str | Path | None = None, frames: int = 8, **options: Any
-) -> np.ndarray:
-    """The first query's episode as an image strip, uint8 (height, frames * width, 3).
+def first_episode_images(
+    policy: str | Path | Policy, task: str | Path | None = None, number: int = 8, **options: Any
+) -> list[np.ndarray]:
+    """`number` images of the first query's episode, uint8 (height, width, 3).
 
-    Arguments and errors as for `evaluate`. Short episodes have fewer frames.
+    Arguments and errors as for `evaluate`. Short episodes have fewer images.
     """
     job = _prepare(policy, task, EvaluationOptions(**options))
     env, begin = job.make(render_mode="rgb_array")
     query = job.query(0)
     actions = rollout(env, query, begin(0, query).act, job.delay).actions
-    steps = np.unique(np.linspace(0, len(actions), frames).round().astype(int)).tolist()
-    image = render_strip(env, query, actions, steps)
+    steps = np.unique(np.linspace(0, len(actions), number).round().astype(int)).tolist()
+    images = render_steps(env, query, actions, steps)
     env.close()
-    return image
+    return images
 
 
 def is_privileged(env_arguments: dict[str, Any]) -> bool:

@@ -184,16 +184,16 @@ def rollouts(
             yield episode.trajectory()
 
 
-def render_strip(
+def render_steps(
     env: RoboArmEnv, query: Query, actions: np.ndarray, steps: Sequence[int]
-) -> np.ndarray:
-    """Images of an episode side by side, uint8 (h, n * w, 3). The episode is replayed, exactly.
+) -> list[np.ndarray]:
+    """Images of an episode, uint8 (h, w, 3). The episode is replayed, exactly.
 
     Args:
         env: an environment like the episode's, which renders to `rgb_array`.
         query: the episode's.
         actions: (T, n), of its `Trajectory`.
-        steps: n numbers from 0 (the start) to T: the steps after which there is an image.
+        steps: numbers from 0 (the start) to T: the steps after which there is an image.
     """
     env.reset_specific(*query)
     images = {0: np.asarray(env.render())}
@@ -201,4 +201,4 @@ def render_strip(
         env.step(action)
         if step in steps:
             images[step] = np.asarray(env.render())
-    return np.concatenate([images[step] for step in steps], axis=1)
+    return [images[step] for step in steps]

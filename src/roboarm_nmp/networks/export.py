@@ -127,7 +127,9 @@ def _export(module, inputs, output_names, variable_axes):
 
 def _distances(x, y, p, mode=None):
     """`torch.cdist` of few points, which `torch.onnx` does not translate."""
-    from onnxscript import opset20 as op
+    from onnxscript import opset20
+
+    op: Any = opset20
 
     if p != 2:
         raise NetworkError("torch.cdist with another norm than the Euclidean one")

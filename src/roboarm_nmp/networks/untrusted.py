@@ -58,7 +58,7 @@ def read_model(path: str | Path) -> "onnx.ModelProto":
     return model
 
 
-def first_line(error: Exception) -> str:
+def first_line(error: BaseException) -> str:
     """What an exception of PyTorch, ONNX or ONNX Runtime says, without the pages that follow."""
     return (str(error).strip() or repr(error)).splitlines()[0][:300]
 

@@ -15,7 +15,13 @@ import torch
 from roboarm_nmp import envs
 from roboarm_nmp.networks.export import save_network
 from roboarm_nmp.networks.untrusted import NetworkError
-from roboarm_nmp.policies.registry import ENV_ARGUMENTS, OUTPUTS, PolicyError, policy_metadata
+from roboarm_nmp.policies.registry import (
+    ENV_ARGUMENTS,
+    OUTPUTS,
+    PolicyError,
+    policy_metadata,
+    recurrent_size,
+)
 from roboarm_nmp.policies.safety_filter import SafetyFilter
 
 
@@ -24,6 +30,7 @@ def save_policy(
     module: torch.nn.Module,
     task: str | Path,
     safety_filter: SafetyFilter | None = None,
+    metadata: dict[str, Any] | None = None,
     **env_arguments: Any,
 ) -> None:
     """Write a module as a policy file.
@@ -33,9 +40,11 @@ def save_policy(
         module: `nn.Module`. Its `forward` receives the observation by name (`observation`,
             `achieved_goal`, `desired_goal` and what else the environment observes), float32
             (N, ...), and returns deterministic actions, float32 (N, n), in [-1, 1]. It may not
-            branch on values or draw random numbers.
+            branch on values or draw random numbers. With an attribute `recurrent_size`, it also
+            receives `recurrent_state` (N, recurrent_size), and returns the action and the next one.
         task: name of the task it was trained on, or path of a scene file; or `TASK@ROBOT`.
         safety_filter: a `policies.safety_filter.SafetyFilter` that belongs to the policy.
+        metadata: more metadata of the file, which JSON can write.
         env_arguments: the arguments of `roboarm_nmp.make` it was trained with: those of
             `policies.registry.ENV_ARGUMENTS`. Others define success, and are not stored.
 
@@ -60,14 +69,21 @@ def save_policy(
         for name in observations[0]
     }
     arguments = {"goal_type": env.goal_type, **env_arguments}
-    metadata = policy_metadata(task, arguments, robot, safety_filter)
+    metadata = policy_metadata(task, arguments, robot, safety_filter) | (metadata or {})
+    outputs = OUTPUTS[:1]
+    if size := recurrent_size(module):
+        outputs = OUTPUTS
+        metadata["recurrent_size"] = size
+        example["recurrent_state"] = torch.zeros(len(observations), size)
     with torch.no_grad():
         action = copy.deepcopy(module).cpu().eval()(**example)
+    if size:
+        action, _ = action
     shape = (len(observations), robot.num_joints)
     if not isinstance(action, torch.Tensor) or action.shape != shape:
         got = tuple(action.shape) if isinstance(action, torch.Tensor) else type(action).__name__
         raise PolicyError(f"{path}: actions for {shape[0]} observations must be {shape}, got {got}")
     try:
-        save_network(path, module, example, metadata, OUTPUTS)
+        save_network(path, module, example, metadata, outputs)
     except NetworkError as error:
         raise PolicyError(str(error)) from error

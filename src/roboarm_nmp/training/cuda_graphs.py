@@ -1,18 +1,11 @@
 """Updates as CUDA graphs: a GPU repeats all kernels of an update at a single launch.
 
-An update of small networks consists of hundreds of kernels of a few microseconds. Their launches
-from Python take longer than their work; a graph has one launch.
-
-    optimizer = adam(parameters, 1e-3, args, device)
-    learn = graphed(learn, args, device)       # a function of tensors that is called many times
-    losses = learn(batch)
-
-A function that becomes a graph does the same at every call: it reads nothing but tensors that stay
-where they are, it has no `.item()`, and nothing on the CPU depends on its results. On a CPU
-`graphed` returns the function itself.
+An update of small networks consists of hundreds of kernels of a few microseconds, and their
+launches from Python take longer than their work. `graphed(update, device)` makes one launch of a
+function that does the same at every call: it reads nothing but tensors that stay where they are,
+it has no `.item()`, and nothing on the CPU depends on its results. On a CPU nothing changes.
 """
 
-import collections
 import warnings
 from collections.abc import Callable, Iterable
 
@@ -22,14 +15,9 @@ import torch
 WARM_UP = 3  # ordinary calls before a capture, in which libraries and optimisers allocate
 
 
-def uses_graphs(args, device: torch.device) -> bool:
-    """Whether updates are graphs: on a GPU, with the flag `--compile`."""
-    return args.compile and device.type == "cuda"
-
-
-def adam(parameters: Iterable, rate: float, args, device: torch.device) -> torch.optim.Adam:
-    """Fused Adam; with graphs, one whose step and learning rate may be part of them."""
-    if not uses_graphs(args, device):
+def adam(parameters: Iterable, rate: float, device: torch.device) -> torch.optim.Adam:
+    """Fused Adam; on a GPU, one whose step and learning rate may be part of a graph."""
+    if device.type != "cuda":
         return torch.optim.Adam(parameters, lr=rate, fused=True)
     tensor = torch.tensor(rate, device=device)  # a graph would repeat a number
     return torch.optim.Adam(parameters, lr=tensor, fused=True, capturable=True)
@@ -44,70 +32,43 @@ def set_learning_rate(optimizer: torch.optim.Optimizer, value: float) -> None:
             group["lr"] = value
 
 
-def graphed(function: Callable, args, device: torch.device) -> Callable:
-    """The function as a CUDA graph, or the function itself where there are no graphs.
+def graphed(function: Callable[[dict], dict], device: torch.device) -> Callable[[dict], dict]:
+    """A function from a dict of tensors, always of the same shapes, to such a dict, as a graph.
 
-    Args:
-        function: from a dict of tensors on the device, and possibly options, to a dict of tensors.
-            Shapes must not change from call to call. Each combination of options, hashable, has a
-            graph of its own.
-        args: the flags, `compile` among them.
-        device: of the tensors.
+    What it returns is overwritten by its next call.
     """
-    return Graphed(function) if uses_graphs(args, device) else function
+    if device.type != "cuda":
+        return function
+    stream = torch.cuda.Stream()
+    graph = torch.cuda.CUDAGraph()
+    inputs, outputs = {}, {}
+    calls = 0
 
-
-class Graphed:
-    """A function whose first calls are ordinary ones, and the later ones replays of a graph.
-
-    What it returns is overwritten by its next call with the same options.
-    """
-
-    def __init__(self, function: Callable):
-        self._function = function
-        self._calls = collections.Counter()
-        self._graphs = {}
-        self._stream = torch.cuda.Stream()
-
-    def __call__(self, tensors: dict, *options) -> dict:
-        if options not in self._graphs:
-            if self._calls[options] < WARM_UP:
-                return self._warm_up(tensors, options)
-            self._graphs[options] = self._capture(tensors, options)
-        graph, inputs, outputs = self._graphs[options]
-        torch._foreach_copy_(  # pyright: ignore[reportPrivateImportUsage]
-            list(inputs.values()), [tensors[name] for name in inputs]
-        )
+    def call(tensors):
+        nonlocal inputs, outputs, calls
+        calls += 1
+        if calls <= WARM_UP:  # on the stream of the capture, as PyTorch demands
+            stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(stream), warnings.catch_warnings():
+                warnings.filterwarnings("ignore", message=".*capturable=True.*")
+                outputs = {name: one.detach() for name, one in function(tensors).items()}
+            torch.cuda.current_stream().wait_stream(stream)
+            return outputs
+        if not inputs:
+            inputs = {name: tensor.clone() for name, tensor in tensors.items()}
+            with torch.cuda.graph(graph, stream=stream):
+                outputs = {name: one.detach() for name, one in function(inputs).items()}
+        for name, tensor in inputs.items():
+            tensor.copy_(tensors[name])
         graph.replay()
         return outputs
 
-    def _warm_up(self, tensors, options):
-        """An ordinary call on the stream of the capture, as PyTorch demands."""
-        self._calls[options] += 1
-        self._stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(self._stream), warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*capturable=True.*")
-            outputs = _detached(self._function(tensors, *options))
-        torch.cuda.current_stream().wait_stream(self._stream)
-        return outputs
-
-    def _capture(self, tensors, options):
-        """The graph, the tensors that it reads, and those that it writes."""
-        inputs = {name: tensor.clone() for name, tensor in tensors.items()}
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=self._stream):
-            outputs = _detached(self._function(inputs, *options))
-        return graph, inputs, outputs
+    return call
 
 
-def _detached(tensors):
-    """Without what backward passes need, which would outlive the call."""
-    return {name: tensor.detach() for name, tensor in tensors.items()}
-
-
-def to_device(array: np.ndarray, device: torch.device | str) -> torch.Tensor:
+def to_device(array: np.ndarray, device: torch.device) -> torch.Tensor:
     """A NumPy array as a tensor on the device; on a GPU without waiting for the copy."""
     tensor = torch.as_tensor(array)
-    if torch.device(device).type == "cuda":
+    if device.type == "cuda":
         return tensor.pin_memory().to(device, non_blocking=True)
     return tensor.to(device)

@@ -1,10 +1,14 @@
-"""Parts of policies' networks: a layer, an arm's kinematics and differences of poses as inputs."""
+"""Parts of policies' networks: a layer, and inputs that ease learning: kinematics, differences."""
+
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
 
+from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.goals import GOAL_TYPES
 from roboarm_nmp.envs.robots.inverse_kinematics import kinematic_chain
 from roboarm_nmp.envs.robots.kernels import JOINT, MIDDLE, POSITION, PRISMATIC, ROTATION, SCALE
 from roboarm_nmp.envs.robots.robot import Robot
@@ -135,3 +139,73 @@ def pose_difference(pose: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
     over_half_a_turn = (here * there).sum(dim=1, keepdim=True) < 0.0
     vector = torch.where(over_half_a_turn, -vector, vector)
     return torch.cat([goal[:, :3] - pose[:, :3], vector], dim=1)
+
+
+class GoalFeatures(nn.Module):
+    """Network inputs: observation, goal and, unless `plain`, functions of them that ease learning.
+
+    Those are sine and cosine of the joint angles, the differences to the goal, and, with
+    `jacobian`, how the joints move the end effector straight to it. They have no parameters.
+
+    Args:
+        env: the environment; its goal type, velocities and link distances are the inputs'.
+        plain: observation and goal as they are.
+        jacobian: without effect where the goal is a configuration.
+
+    Attributes:
+        size: number of inputs.
+        num_joints: n of the arm.
+    """
+
+    middle: torch.Tensor
+    half_range: torch.Tensor
+
+    def __init__(self, env: RoboArmEnv, plain: bool = False, jacobian: bool = True):
+        super().__init__()
+        bare = env.unwrapped
+        observation_space: Any = env.observation_space
+        bare_space: Any = bare.observation_space
+        robot = bare.robot
+        self.plain = plain
+        self.num_joints = robot.num_joints
+        goal_type = GOAL_TYPES[bare.goal_type]
+        self.to_configuration = goal_type.has_configuration
+        self.to_position = goal_type.has_position and not goal_type.has_rotation
+        self.to_pose = goal_type.has_rotation
+        self.jacobian = None
+        if jacobian and not plain and goal_type.has_position:
+            self.jacobian = JacobianTranspose(robot, rotates=goal_type.has_rotation)
+        low, high = torch.tensor(robot.lower), torch.tensor(robot.upper)
+        self.register_buffer("middle", ((high + low) / 2).float())
+        self.register_buffer("half_range", ((high - low) / 2).float())
+        # The configuration, velocities (or not) and the end effector's position or pose.
+        end = bare_space["observation"].shape[0]
+        self.ee = slice(end - goal_type.end_effector_size, end)
+        # Link distances follow; the first number of each link is the distance.
+        links, numbers = robot.link_distances_shape
+        near = slice(end, end + links * numbers, numbers)
+        self.distances = near if getattr(env, "appends_link_distances", False) else None
+        observation = torch.zeros(1, *observation_space["observation"].shape)
+        goal = torch.zeros(1, *observation_space["desired_goal"].shape)
+        self.size = self(observation, goal).shape[1]
+
+    def forward(self, observation: torch.Tensor, desired_goal: torch.Tensor) -> torch.Tensor:
+        """(N, o), (N, g) -> (N, size)."""
+        inputs = [observation, desired_goal]
+        if not self.plain:
+            joints = self.num_joints
+            angles = observation[:, :joints] * self.half_range + self.middle
+            inputs += [torch.sin(angles), torch.cos(angles)]
+            if self.to_pose:
+                inputs.append(5.0 * pose_difference(observation[:, self.ee], desired_goal))
+            if self.to_position:
+                inputs.append(5.0 * (desired_goal[:, -3:] - observation[:, self.ee]))
+            if self.jacobian is not None:
+                position = observation[:, self.ee][:, :3]
+                towards = self.jacobian(observation[:, :joints], position, inputs[-1])
+                inputs += [towards, towards / (towards.norm(dim=1, keepdim=True) + 1e-6)]
+            if self.to_configuration:
+                inputs.append(5.0 * (desired_goal[:, :joints] - observation[:, :joints]))
+        if self.distances is not None:
+            inputs.append(10.0 * observation[:, self.distances])  # they are small numbers
+        return torch.cat(inputs, dim=1)
