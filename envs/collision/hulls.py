@@ -34,6 +34,7 @@ from roboarm_nmp.envs.robots.body import body_alone, collision_elements
 from roboarm_nmp.envs.robots.robot import Link, Robot
 from roboarm_nmp.envs.robots.rotations import matrix
 from roboarm_nmp.envs.scenes.primitives import ConvexHull, Cylinder, Sphere, to_array
+from roboarm_nmp.utils.bullet import load_urdf
 from roboarm_nmp.utils.bullet import pybullet as p
 from roboarm_nmp.utils.files import temporary_file
 
@@ -140,7 +141,7 @@ def _shapes(client, robot, body, link):
         for element in collision_elements(robot, robot.link_names[link]):
             for text in _one_by_one(element):
                 with temporary_file(_ONE_SHAPE.format(text), ".urdf") as urdf:
-                    alone = p.loadURDF(urdf, physicsClientId=client)
+                    alone = load_urdf(urdf, physicsClientId=client)
                 yield from _shapes(client, robot, alone, -1)
                 p.removeBody(alone, physicsClientId=client)
         return

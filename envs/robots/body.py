@@ -11,6 +11,7 @@ import numpy as np
 from roboarm_nmp.envs.robots.attached_xml import attached_elements
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.robots.rotations import matrix, signed
+from roboarm_nmp.utils.bullet import load_urdf
 from roboarm_nmp.utils.bullet import pybullet as p
 from roboarm_nmp.utils.files import temporary_file
 
@@ -77,7 +78,7 @@ class Body:
 
     def _load(self, robot, client, urdf, flags=0):
         self.robot, self.client = robot, client
-        self.id = p.loadURDF(
+        self.id = load_urdf(
             urdf,
             robot.base_position,
             robot.base_orientation,
@@ -193,7 +194,7 @@ def names_in_bullet(robot: Robot) -> tuple[tuple[str, ...], dict[int, str]]:
     client = p.connect(p.DIRECT)
     try:
         with _readable_urdf(robot) as urdf:
-            body = p.loadURDF(urdf, flags=p.URDF_IGNORE_VISUAL_SHAPES, physicsClientId=client)
+            body = load_urdf(urdf, flags=p.URDF_IGNORE_VISUAL_SHAPES, physicsClientId=client)
         number = p.getNumJoints(body, physicsClientId=client)
         infos = [p.getJointInfo(body, i, physicsClientId=client) for i in range(number)]
         links = {-1: p.getBodyInfo(body, physicsClientId=client)[0].decode()}

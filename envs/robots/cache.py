@@ -13,6 +13,8 @@ from collections.abc import Callable
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.utils.files import cache_folder, write_atomically
 
+VERSION = 2  # of the results: files of another one are not read
+
 
 def cached(name: str, robot: Robot, settings: list, compute: Callable):
     """The result of `compute()`, from the cache where it has it.
@@ -27,7 +29,7 @@ def cached(name: str, robot: Robot, settings: list, compute: Callable):
     # Contents of meshes are in the robot's fingerprint; their paths do not matter.
     xml = re.sub(r'filename="[^"]*"', "", robot.xml)
     version = importlib.metadata.version("pybullet")
-    key = json.dumps([name, robot.fingerprint, xml, settings, version])
+    key = json.dumps([VERSION, name, robot.fingerprint, xml, settings, version])
     file = f"{hashlib.sha256(key.encode()).hexdigest()}.json"
     with contextlib.suppress(OSError, ValueError):
         (result,) = json.loads((cache_folder() / "robots" / file).read_bytes())

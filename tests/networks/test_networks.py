@@ -327,17 +327,102 @@ def _inconsistent(folder):
     return _model([helper.make_node("MatMul", ["x", "w"], ["y"])], [weights])
 
 
+def _one(operator, *sizes, outputs=("y",), **attributes):
+    """A model of one operator: of `x` and of stored tensors of some sizes."""
+    tensors = [_constant(f"w{i}", np.zeros(size), np.float32) for i, size in enumerate(sizes)]
+    names = ["x", *(tensor.name for tensor in tensors)]
+    return _model([helper.make_node(operator, names, outputs, **attributes)], tensors)
+
+
+def _axis(folder):
+    return _one("LayerNormalization", 3, outputs=("y", "mean"), axis=2**31)
+
+
+def _missing(folder):
+    model = _one("LayerNormalization", 3)
+    model.graph.node[0].input.append("")
+    return model
+
+
+def _outputs(folder):
+    return _one("Split", outputs=("y", "z", "w"), axis=1, num_outputs=1)
+
+
+def _negative(folder):
+    nodes = [helper.make_node("GatherND", ["x", "indices"], ["y"], batch_dims=-(2**31))]
+    return _model(nodes, [_constant("indices", [[0]])])
+
+
+def _negative_input(folder):
+    nodes = [helper.make_node("Slice", ["x", "from", "to"], ["y"])]
+    return _model(nodes, [_constant("from", [0]), _constant("to", [1])], shape=(-1, 3))
+
+
+def _text(folder):
+    return _one("Cast", to=TensorProto.STRING)
+
+
+def _read(folder):
+    """Little is computed, but from much, and again and again."""
+    nodes = [helper.make_node("Expand", ["x", "size"], ["big"])]
+    nodes += [helper.make_node("ReduceLogSumExp", ["big"], [f"v{i}"]) for i in range(1_000)]
+    nodes += [helper.make_node("Max", [f"v{i}" for i in range(1_000)], ["y"])]
+    return _model(nodes, [_constant("size", [2**20, 3])])
+
+
+def _long(folder):
+    """A vector, which ONNX could take for sizes, of a hundred bytes each."""
+    nodes = [helper.make_node("Expand", ["one", "size"], ["v0"])]
+    nodes += [helper.make_node("Add", [f"v{i}", f"v{i}"], [f"v{i + 1}"]) for i in range(9)]
+    return _model(
+        [*nodes, helper.make_node("ReduceMax", ["v9"], ["y"])],
+        [_constant("one", [1]), _constant("size", [2**22])],
+    )
+
+
+def _patches(folder):
+    """A small image and a small result; between them, a matrix of gigabytes."""
+    nodes = [
+        helper.make_node("Expand", ["x", "size"], ["image"]),
+        helper.make_node("ConvTranspose", ["image", "w"], ["y"], pads=[250] * 4),
+    ]
+    weights = _constant("w", np.zeros((1, 1, 40, 40)), np.float32)
+    return _model(nodes, [_constant("size", [1, 1, 512, 512]), weights], shape=("N", 1))
+
+
+def _renamed(folder):
+    """A result with the name of a stored tensor: which of them would be the size?"""
+    value = _constant("", [2**40])
+    nodes = [
+        helper.make_node("Constant", [], ["size"], value=value),
+        helper.make_node("Expand", ["one", "size"], ["big"]),
+        helper.make_node("ReduceMax", ["big"], ["max"], keepdims=0),
+        helper.make_node("Add", ["x", "max"], ["y"]),
+    ]
+    return _model(nodes, [_constant("size", [1]), _constant("one", 1, np.float32)])
+
+
 HOSTILE = {
     _external: "its tensors are in another file",
     _loop: "the operator Loop is not allowed",
     _custom: "the operator com.example.Evil is not allowed",
     _function: "it holds functions",
-    _filled: "ConstantOfShape computes more than 33,554,432 numbers",
-    _expanded: "Expand computes more than 33,554,432 numbers",
+    _filled: "ConstantOfShape computes more than 16,777,216 numbers",
+    _expanded: "Expand computes more than 16,777,216 numbers",
     _slow: "it computes too much",
     _divided: "it divides integers",
+    _axis: "LayerNormalization has a wrong axis",
+    _missing: "LayerNormalization lacks an input",
+    _outputs: "Split has a wrong num_outputs",
+    _negative: "GatherND has a wrong batch_dims",
+    _negative_input: "the size of x is not positive",
+    _text: "it holds text",
+    _read: "it computes too much",
+    _long: "it computes too much",
+    _patches: "it computes too much",
+    _renamed: "a result of Constant has the name of another tensor",
     _data_dependent: "the shape of a result of ConstantOfShape depends on values",
-    _many: "it has 25,001 operators, not 1 to 20,000",
+    _many: "it has 25,001 operators, not 1 to 10,000",
     _incomplete: "damaged",
     _inconsistent: "damaged",
 }

@@ -18,7 +18,7 @@ from attacks import children, files
 
 # How many attempts a night makes, and how many of them share a process.
 SIZES = {
-    "networks": (10_000, 1),
+    "networks": (10_000, 20),
     "files": (20_000, 200),
     "robots": (10_000, 1),
     "clouds": (10_000, 100),

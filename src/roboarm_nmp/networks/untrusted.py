@@ -10,15 +10,18 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 if TYPE_CHECKING:  # it takes a while to import
     import onnx
 
 MAX_BYTES = 100_000_000  # of a file
-MAX_OTHER_BYTES = 4_000_000  # without weights: parsed, they may take a hundred times the memory
-MAX_NODES = 20_000
-MAX_ELEMENTS = 2**25  # numbers in a tensor, stored or computed
-MAX_COMPUTED = 2**27  # numbers in all computed tensors
-MAX_PRODUCTS = 2**34  # multiplications: about a second
+MAX_OTHER_BYTES = 1_000_000  # without weights: parsed, they may take a hundred times the memory
+MAX_NODES = 10_000
+MAX_ELEMENTS = 2**24  # numbers in a tensor, stored or computed
+MAX_KNOWN = 100  # numbers in a tensor of sizes or indices
+MAX_COMPUTED = 2**26  # numbers that all operators read and compute
+MAX_PRODUCTS = 2**31  # multiplications
 _NAMES = """
 Abs Add And ArgMax ArgMin Atan AveragePool BatchNormalization Cast Ceil Clip Concat Constant
 ConstantOfShape Conv ConvTranspose Cos CumSum Div Elu Equal Erf Exp Expand Flatten Floor Gather
@@ -28,6 +31,9 @@ LogSoftmax MatMul Max MaxPool Min Mish Mul Neg Not Or PRelu Pad Pow Range Recipr
 ReduceLogSumExp ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum Relu Reshape Round Selu Shape
 Sigmoid Sign Sin Slice Softmax Softplus Split Sqrt Squeeze Sub Sum Tan Tanh Tile TopK Transpose
 Trilu Unsqueeze Where Xor
+"""
+_NAMES_OF_SIZES = """
+Add Cast Concat Gather Mul Range Reshape Shape Slice Squeeze Sub Unsqueeze
 """
 OPERATORS = set(_NAMES.split())
 """Names of the ONNX operators that a network may use. Your own code may add to them."""
@@ -122,12 +128,22 @@ def _check_contents(model):
         for attribute in node.attribute:
             if attribute.HasField("g") or attribute.graphs or attribute.HasField("sparse_tensor"):
                 raise NetworkError(f"{node.op_type} holds a graph or a sparse tensor")
+            # By these, and by an input that is left out, the process would end.
+            numbers = [attribute.i, *attribute.ints]
+            lowest = -10 if attribute.name in ("axis", "axes") else 0
+            outputs = len(node.output) if attribute.name == "num_outputs" else attribute.i
+            if min(numbers) < lowest or max(numbers) > MAX_ELEMENTS or attribute.i != outputs:
+                raise NetworkError(f"{node.op_type} has a wrong {attribute.name}")
             tensors += [*attribute.tensors, attribute.t]
+        if "" in node.input and node.op_type != "Clip":
+            raise NetworkError(f"{node.op_type} lacks an input")
     for tensor in tensors:
         if tensor.external_data or tensor.data_location:
             raise NetworkError("its tensors are in another file")
         if min(tensor.dims, default=0) < 0 or math.prod(tensor.dims) > MAX_ELEMENTS:
             raise NetworkError(f"it has a tensor of more than {MAX_ELEMENTS:,} numbers")
+        if tensor.data_type == onnx.TensorProto.STRING:
+            raise NetworkError("it holds text")
         if tensor.data_type:
             onnx.numpy_helper.to_array(tensor)  # raises if a part of it is missing
 
@@ -135,46 +151,66 @@ def _check_contents(model):
 def _check_computation(model):
     """Raise NetworkError unless what it computes, for a batch of one, is within the limits."""
     import onnx
+    from onnx.reference import ReferenceEvaluator
 
-    shapes_only = onnx.ModelProto()
-    shapes_only.CopyFrom(model)
-    graph = shapes_only.graph
-    del graph.initializer[:], graph.value_info[:]
-    for value in (*graph.input, *graph.output):
-        for axis, size in enumerate(value.type.tensor_type.shape.dim):
+    graph = model.graph
+    versions = {one.domain: one.version for one in model.opset_import}
+    integers = (onnx.TensorProto.INT32, onnx.TensorProto.INT64)
+    types, sizes, known = {}, {}, {}  # of tensors by name; `known` are those of sizes and indices
+    for value in graph.input:
+        kind = types[value.name] = onnx.TypeProto()
+        kind.CopyFrom(value.type)
+        for axis, size in enumerate(kind.tensor_type.shape.dim):
             if not size.HasField("dim_value"):
                 size.dim_value = 1 if axis == 0 else 64
-    for tensor in model.graph.initializer:
-        if math.prod(tensor.dims) <= 1_000:
-            graph.initializer.append(tensor)
-        else:
-            large = onnx.helper.make_tensor_value_info(tensor.name, tensor.data_type, tensor.dims)
-            graph.input.append(large)
-    graph = onnx.shape_inference.infer_shapes(shapes_only, True, True, True).graph
-    sizes = {tensor.name: list(tensor.dims) for tensor in graph.initializer}
-    dtypes = {}
-    for value in (*graph.input, *graph.value_info, *graph.output):
-        kind = value.type.tensor_type
-        dtypes[value.name] = kind.elem_type
-        if kind.HasField("shape") and all(size.HasField("dim_value") for size in kind.shape.dim):
-            sizes[value.name] = [size.dim_value for size in kind.shape.dim]
+            elif size.dim_value < 1:
+                raise NetworkError(f"the size of {value.name} is not positive")
+    for tensor in graph.initializer:
+        types[tensor.name] = onnx.helper.make_tensor_type_proto(tensor.data_type, tensor.dims)
+        if tensor.data_type in integers and math.prod(tensor.dims) <= MAX_KNOWN:
+            known[tensor.name] = tensor
     computed = products = 0
     for node in graph.node:
-        for name in filter(None, node.output):
-            if name not in sizes:
+        inputs = [name for name in node.input if name]
+        if not types.keys().isdisjoint(node.output):
+            raise NetworkError(f"a result of {node.op_type} has the name of another tensor")
+        schema = onnx.defs.get_schema(node.op_type, versions[node.domain], node.domain)
+        types |= onnx.shape_inference.infer_node_outputs(
+            schema, node, {name: types[name] for name in inputs}, known, None, model.opset_import
+        )
+        for name in (*inputs, *filter(None, node.output)):
+            kind = types.get(name, onnx.TypeProto()).tensor_type
+            shape = kind.shape.dim
+            if not kind.HasField("shape") or not all(size.HasField("dim_value") for size in shape):
                 raise NetworkError(f"the shape of a result of {node.op_type} depends on values")
+            sizes[name] = [size.dim_value for size in shape]
             number = math.prod(sizes[name])
             if number > MAX_ELEMENTS or min(sizes[name], default=0) < 0:
                 raise NetworkError(f"{node.op_type} computes more than {MAX_ELEMENTS:,} numbers")
+            if kind.elem_type == onnx.TensorProto.STRING:
+                raise NetworkError("it holds text")
             computed += number
-            if node.op_type in ("MatMul", "Gemm", "Conv", "ConvTranspose") and number:
-                channels = sizes[name][1 if "Conv" in node.op_type else -1]
-                products += number * math.prod(sizes[node.input[1]]) // channels
-            elif node.op_type in ("AveragePool", "MaxPool"):
-                kernels = [one.ints for one in node.attribute if one.name == "kernel_shape"]
-                products += number * math.prod(kernels[0])
+        is_known = node.op_type == "Shape" or known.keys() >= {*inputs}
+        is_size = node.op_type in _NAMES_OF_SIZES.split() and kind.elem_type in integers
+        if is_known and is_size and number <= MAX_KNOWN:
+            if node.op_type == "Shape":
+                arrays = {inputs[0]: np.broadcast_to(np.float32(0), sizes[inputs[0]])}
+            else:
+                arrays = {name: onnx.numpy_helper.to_array(known[name]) for name in inputs}
+            (array,) = ReferenceEvaluator(node, opsets=versions).run(None, arrays)
+            known[node.output[0]] = onnx.numpy_helper.from_array(np.asarray(array))
+        if node.op_type in ("MatMul", "Gemm") and number:
+            products += number * math.prod(sizes[node.input[1]]) // sizes[name][-1]
+        elif node.op_type in ("Conv", "ConvTranspose"):
+            weights = sizes[node.input[1]]
+            most = max(number, math.prod(sizes[node.input[0]])) * math.prod(weights[1:])
+            products += most
+            computed += most // weights[0]  # patches of the image, as a matrix
+        elif node.op_type in ("AveragePool", "MaxPool"):
+            kernels = [one.ints for one in node.attribute if one.name == "kernel_shape"]
+            products += 8 * number * math.prod(kernels[0])  # slower than the others
         # By zero, the process would end.
-        if node.op_type == "Div" and dtypes[node.output[0]] != onnx.TensorProto.FLOAT:
+        if node.op_type == "Div" and kind.elem_type != onnx.TensorProto.FLOAT:
             raise NetworkError("it divides integers")
     if computed > MAX_COMPUTED or products > MAX_PRODUCTS:
         raise NetworkError("it computes too much")

@@ -1,10 +1,13 @@
 """PyBullet, without the line "pybullet build time: ..." that its C code prints when it is imported.
 
+from roboarm_nmp.utils.bullet import load_urdf
 from roboarm_nmp.utils.bullet import pybullet as p
 """
 
 import contextlib
+import ctypes
 import os
+from typing import Any
 
 
 @contextlib.contextmanager
@@ -27,4 +30,23 @@ def _no_stderr():
 with _no_stderr():
     import pybullet
 
-__all__ = ["pybullet"]
+__all__ = ["load_urdf", "pybullet"]
+
+_LC_NUMERIC_MASK = 2  # of glibc's newlocale
+_C = ctypes.CDLL(None)
+_C.newlocale.restype = _C.uselocale.restype = ctypes.c_void_p
+_C.uselocale.argtypes = [ctypes.c_void_p]
+_POINTS = _C.newlocale(_LC_NUMERIC_MASK, b"C", None)
+
+
+def load_urdf(*args: Any, **kwargs: Any) -> int:
+    """`pybullet.loadURDF`, for which 0.5 is one half in every locale.
+
+    PyBullet reads a URDF's numbers and those of its meshes with the locale of the process, which Qt
+    and `locale.setlocale(locale.LC_ALL, "")` set: with a decimal comma, 0.5 would be 0.
+    """
+    before = _C.uselocale(_POINTS)  # of this thread alone
+    try:
+        return pybullet.loadURDF(*args, **kwargs)
+    finally:
+        _C.uselocale(before)
