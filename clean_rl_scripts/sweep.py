@@ -1,7 +1,7 @@
 """Search over the flags of a trainer, with Optuna, on this machine or on a Ray cluster.
 
     roboarm sweep clean_rl_scripts/td3_her_mp.py \\
-        --folder sweeps/td3 --trials 20 --search policy-lr=1e-6..5e-3:log q-lr=1e-6..5e-3:log \\
+        --folder sweeps/td3 --trials 20 --search learning-rate=1e-6..5e-3:log \\
         -- --task double_walls_wide_gap --total-timesteps 100000
 
 The search space: `NAME=LOW..HIGH` (integers if both are; `:log` for a logarithmic scale) or
@@ -81,7 +81,7 @@ def parse_search(text: str):
 
 
 def flags_of(params: dict) -> list[str]:
-    """`{"policy-lr": 1e-3, "autotune": "false"}` -> `["--policy-lr=0.001", "--no-autotune"]`."""
+    """`{"gamma": 0.98, "jacobian": "false"}` -> `["--gamma=0.98", "--no-jacobian"]`."""
     switches = {"true": "--{}", "false": "--no-{}"}
     return [switches.get(value, "--{}={}").format(name, value) for name, value in params.items()]
 

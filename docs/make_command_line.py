@@ -58,14 +58,21 @@ the name of a task.
 | `--simulate` | `no` | also check in the simulator that every start and goal is feasible |
 """,
 }  # commands whose flags are not in a dataclass
+SHARED = {
+    "RunArgs": "Flags of the run",
+    "EnvArgs": "Flags of the environment",
+    "EncoderFlags": "Flags of the encoders",
+}  # base classes of the flags that several trainers have: class -> heading
 
 
 def flags_of(module):
     """The dataclass of a script's flags, `Args` or `...Args`; None if it has none of its own."""
-    for name, value in vars(module).items():
-        if name.endswith("Args") and value.__module__ == module.__name__:
-            return value
-    return None
+    own = {
+        name: value
+        for name, value in vars(module).items()
+        if name.endswith("Args") and value.__module__ == module.__name__
+    }
+    return own.get("Args") or next(iter(own.values()), None)
 
 
 def meanings(cls):
@@ -124,7 +131,7 @@ def page():
     commands = trainers | {name: entry for name, entry in COMMANDS.items() if entry[0]}
     for name, (_, summary) in commands.items():
         lines.append(f"| [`{name}`](#roboarm-{name.replace(' ', '-')}) | {summary} |")
-    shared = {}  # class of flags -> trainers that have them
+    shared = {}  # class of flags -> its table, and the trainers that have it
     sections = []
     for name, (path, summary) in commands.items():
         Args = flags_of(importlib.import_module(f"roboarm_nmp.{path}"))
@@ -133,15 +140,20 @@ def page():
             sections += ["", BY_HAND[name].rstrip()]
             continue
         bases = [one for one in Args.__mro__[1:] if dataclasses.is_dataclass(one)]
-        for one in bases:
-            shared.setdefault(one, []).append(name)
+        for one in bases:  # each trainer's file has its own copy of a class
+            rows, users = shared.setdefault(one.__name__, (table(one), []))
+            assert rows == table(one), f"the trainers' {one.__name__} differ"
+            users.append(name)
         if bases:
-            links = [f"[`{one.__name__}`](#{one.__name__.lower()})" for one in bases]
-            sections += ["", f"Also the flags of {', '.join(links)}."]
+            links = []
+            for one in bases:
+                heading = SHARED[one.__name__].lower()
+                links.append(f"[{heading}](#{heading.replace(' ', '-')})")
+            sections += ["", f"Also the {' and the '.join(links)}."]
         sections += ["", *table(Args)]
-    for one, users in shared.items():
-        sections += ["", f"## {one.__name__}", "", one.__doc__.strip(), ""]
-        sections += [f"Of `{'`, `'.join(users)}`.", "", *table(one)]
+    for name, (rows, users) in shared.items():
+        sections += ["", f"## {SHARED[name]}", ""]
+        sections += [f"Of `{'`, `'.join(users)}`.", "", *rows]
     return "\n".join([*lines, *sections, ""])
 
 

@@ -1,23 +1,35 @@
-"""docs/customise/algorithm.md: its example is carried out."""
+"""docs/customise/algorithm.md: its excerpts are SAC's, and its example is carried out."""
 
 import json
 import re
+import subprocess
 
 from paths import ROOT
 from trainers import PATHS, TINIER, run_here, succeeds_here
 
 PAGE = (ROOT / "docs/customise/algorithm.md").read_text()
+SAC = PATHS["sac_her_mp"].read_text()
 
 
-def test_copied_and_changed_trainer_runs_resumes_and_is_evaluated(tmp_path):
-    before, after = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[:2]
-    source = PATHS["sac_her_mp"].read_text()
-    assert source.count(before) == 1
-    script = tmp_path / "sac_final_mp.py"
-    script.write_text(source.replace(before, after))
+def test_excerpts_of_the_walk_stand_in_the_trainer():
+    walk = PAGE.partition("\n## A walk")[2].partition("\n## ")[0]
+    excerpts = re.findall(r"```python\n(.*?)```", walk, re.DOTALL)
+    assert len(excerpts) >= 5
+    for excerpt in excerpts:
+        assert excerpt in SAC
+
+
+def test_redq_diff_applies_and_trains_resumes_and_is_evaluated(tmp_path):
+    (diff,) = re.findall(r"```diff\n(.*?)```", PAGE, re.DOTALL)
+    assert len(re.findall(r"^\+(?!\+\+)", diff, re.MULTILINE)) <= 20
+    script = tmp_path / "clean_rl_scripts" / "redq_her_mp.py"
+    script.parent.mkdir()
+    script.write_text(SAC)
+    subprocess.run(["git", "apply"], input=diff, text=True, cwd=tmp_path, check=True)
+    assert "NUM_CRITICS = 5" in script.read_text()
 
     run_here(script, "--runs-dir", tmp_path / "runs", *TINIER.split(), "--task", "wall")
-    (run,) = (tmp_path / "runs").glob("wall__sac_final_mp__1__*")
+    (run,) = (tmp_path / "runs").glob("wall__redq_her_mp__1__*")
     run_here(script, "--resume", run, "--total-timesteps", "600")
     assert json.loads((run / "result.json").read_text())["steps"] == 600
     flags = ["--task", "wall", "--policy", run, "--num-queries", "2"]

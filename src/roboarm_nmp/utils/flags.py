@@ -45,16 +45,16 @@ GROUPS = {
     ),
     "safety_filter": ("safety_margin", "escape", "approach", "lookahead", "obstacle_velocities"),
     "data": (
-        *("demo_prob", "demos", "num_demos", "bc_weight", "demo_batch_size"),
+        *("demo_prob", "demos", "num_demos", "bc_weight"),
         *("paths", "observations", "validation_share"),
     ),
     OTHERS: (),
     "evaluation": (
         *("eval_every", "eval_queries", "test_queries", "stop_at_success", "eval_scenes"),
-        *("measure_clearance", "action_delay", "real_time"),
+        *("capture_video", "measure_clearance", "action_delay", "real_time"),
     ),
     "run": (
-        *("seed", "runs_dir", "resume", "device", "bf16", "compile", "track", "workers"),
+        *("seed", "runs_dir", "resume", "device", "bf16", "track", "workers"),
         *("ray_address",),
     ),
     "output": ("output", "overwrite", "repair", "shard_size", "json", "image"),
