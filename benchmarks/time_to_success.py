@@ -50,10 +50,10 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from roboarm_nmp import envs
-from roboarm_nmp.clean_rl_scripts import sac_her_mp
-from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.training import protocol
+from roboarm_nmp.evaluation.evaluate import evaluate
+from roboarm_nmp.training.network_parts import GoalFeatures
+from roboarm_nmp.training.runs import Run
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.files import write_atomically
 
@@ -86,23 +86,34 @@ class Args:
     """train the first learner with the first seed in this process; the command does so itself"""
 
 
+@dataclasses.dataclass
+class FreshQueries:
+    """Queries as `roboarm_nmp.evaluate` takes them."""
+
+    start: np.ndarray
+    goal: np.ndarray
+    scenes: list  # of `Scene`s
+
+
 def fresh_queries(task):
     """The `QUERIES` queries that decide, none of which is in the task's file."""
     env, rng = envs.make(task), np.random.default_rng(QUERY_SEED)
     env.reset(seed=0)
-    queries = [Query(*env.sample_query(rng), env.unwrapped.scene) for _ in range(QUERIES)]
+    pairs = [env.sample_query(rng) for _ in range(QUERIES)]
+    scene = env.unwrapped.scene
     env.close()
-    return queries
+    starts, goals = zip(*pairs, strict=True)
+    return FreshQueries(np.array(starts), np.array(goals), [scene] * QUERIES)
 
 
 class Clock:
     """Seconds of training; solves the fresh queries now and then, while the clock stands still."""
 
     def __init__(self, task, limit):
+        self.task = task
         self.goal = GOALS[task]
         self.limit = limit
         self.queries = fresh_queries(task)
-        self.envs = protocol.make_eval_envs(task, QUERIES)
         self.curve = []
         self.paused = 0.0  # s
         self.began = 0.0
@@ -111,44 +122,57 @@ class Clock:
         self.began = time.perf_counter()
 
     def evaluate(self, policy, steps, updates):
-        """Whether training ends here: `policy`, a module as for `protocol.evaluate`, is good."""
+        """The result of a policy, as of `roboarm_nmp.evaluate`."""
         now = time.perf_counter()
-        result = protocol.evaluate(policy, self.envs, self.queries, torch.device("cpu"))
+        result = evaluate(policy, self.task, queries=self.queries)
         seconds = now - self.began - self.paused
         self.paused += time.perf_counter() - now
         point = {"steps": steps, "updates": updates, "seconds": seconds}
         self.curve.append(point | {"success": result["success_rate"]})
         print(json.dumps(self.curve[-1]), flush=True)
-        return result["success_rate"] >= self.goal or seconds >= self.limit
+        return result
+
+    @property
+    def is_over(self):
+        """Whether training ends here: the latest policy is good, or it takes too long."""
+        latest = self.curve[-1]
+        return latest["success"] >= self.goal or latest["seconds"] >= self.limit
 
 
 def train_ours(task, seed, clock, changed):
     """Run the trainer as it is, but for the queries that it is validated on."""
+    runs = []  # the trainer's only one
 
     class Done(Exception):
         pass
 
     def start(run, *args):
+        runs.append(run)
         started(run, *args)
         clock.start()
 
-    def validate(run, policy):
+    def evaluate_fresh(policy, task, queries):
+        (run,) = runs
         steps = max(0, run.step - run.args.learning_starts)
-        if clock.evaluate(policy, run.step, int(steps * run.args.updates_per_step)):
+        result = clock.evaluate(policy, run.step, int(steps * run.args.updates_per_step))
+        if clock.is_over:
             run.close()
             raise Done
-        return False
+        return result
 
-    started = protocol.PolicyRun.start
-    script = sac_her_mp.__file__
-    sys.argv = [script, "--task", task, "--seed", str(seed), "--eval-every", str(INTERVAL)]
+    started = Run.start
+    script = ROOT / "clean_rl_scripts" / "sac_her_mp.py"
+    sys.argv = [str(script), "--task", task, "--seed", str(seed), "--eval-every", str(INTERVAL)]
     sys.argv += ["--runs-dir", os.environ["TMPDIR"], "--total-timesteps", "10000000"]
     if task == "double_walls":
         sys.argv += ["--demo-prob", "1", "--bc-weight", "5"]
     sys.argv += changed
-    changed_run = mock.patch.multiple(protocol.PolicyRun, start=start, validate=validate)
-    with changed_run, contextlib.suppress(Done):
-        runpy.run_path(script, run_name="__main__")
+    with (
+        mock.patch.object(Run, "start", start),
+        mock.patch("roboarm_nmp.evaluation.evaluate.evaluate", evaluate_fresh),
+        contextlib.suppress(Done),
+    ):
+        runpy.run_path(str(script), run_name="__main__")
 
 
 class OurFeatures(torch.nn.Module):
@@ -156,17 +180,11 @@ class OurFeatures(torch.nn.Module):
 
     def __init__(self, observation_space):
         super().__init__()
-        self.features = sac_her_mp.Features(our_args(), envs.make("no_obstacles"))
+        self.features = GoalFeatures(envs.make("no_obstacles"))
         self.features_dim = self.features.size
 
     def forward(self, data):
         return self.features(data["observation"], data["desired_goal"])
-
-
-def our_args():
-    args = sac_her_mp.Args()
-    args.task = "no_obstacles"
-    return args
 
 
 def train_peer(name, task, seed, clock):
@@ -175,8 +193,11 @@ def train_peer(name, task, seed, clock):
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.env_util import make_vec_env
 
+    from roboarm_nmp.clean_rl_scripts.sac_her_mp import Args as OurArgs
+    from roboarm_nmp.clean_rl_scripts.sac_her_mp import discount_factor
+
     torch.set_num_threads(1)
-    args = our_args()
+    args = OurArgs()
     ours = name == "sb3-ours"
     her = {"n_sampled_goal": 4, "goal_selection_strategy": "future"}
     options = {"replay_buffer_class": HerReplayBuffer, "replay_buffer_kwargs": her, "seed": seed}
@@ -184,17 +205,15 @@ def train_peer(name, task, seed, clock):
     number = args.num_envs if ours else 1
     if ours:
         steps = round(1 / args.updates_per_step)
-        gamma = sac_her_mp.discount_factor(args.gamma, PANDA)
-        options |= {"learning_rate": args.q_lr, "gamma": gamma, "tau": args.tau}
+        gamma = discount_factor(args.gamma, PANDA)
+        options |= {"learning_rate": args.learning_rate, "gamma": gamma, "tau": args.tau}
         options |= {"train_freq": steps, "gradient_steps": args.num_envs}
         size = [args.hidden_size] * args.num_hidden_layers
         networks = {"features_extractor_class": OurFeatures, "net_arch": size}
         options["policy_kwargs"] = networks
 
-    class Policy(torch.nn.Module):
-        def forward(self, **data):
-            data = {key: value.numpy() for key, value in data.items()}
-            return torch.from_numpy(np.array(model.predict(data, deterministic=True)[0]))
+    def policy(observation):
+        return model.predict(observation, deterministic=True)[0]
 
     class Evaluate(BaseCallback):
         def _on_training_start(self):
@@ -203,7 +222,8 @@ def train_peer(name, task, seed, clock):
         def _on_step(self):
             if self.num_timesteps % INTERVAL >= number:
                 return True
-            return not clock.evaluate(Policy(), self.num_timesteps, model._n_updates)
+            clock.evaluate(policy, self.num_timesteps, model._n_updates)
+            return not clock.is_over
 
     vec_env = make_vec_env(envs.gymnasium_id(task), number, seed=seed)
     model = SAC("MultiInputPolicy", vec_env, **options)
