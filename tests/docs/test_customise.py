@@ -104,7 +104,9 @@ def test_changed_replay_buffer_charges_contacts(tmp_path, monkeypatch):
     script.write_text(sources[0].replace(before, after))
     monkeypatch.setitem(PATHS, "changed", script)
     env = envs.make("no_obstacles")
-    buffer = load("changed").HerReplayBuffer(env, 100, 0.0, np.random.default_rng(0))
+    changed = load("changed")
+    args = changed.Args(her_probability=0.0)
+    buffer = changed.HerReplayBuffer(env, 100, args, np.random.default_rng(0))
     step = {name: np.zeros(10) for name in ("observation", "next_observation")}
     step |= {"action": np.zeros(7), "next_achieved_goal": np.zeros(3)}
     step["desired_goal"] = np.ones(3)

@@ -186,7 +186,7 @@ def test_run_of_the_page_is_trained_and_evaluated(page):
     result = json.loads((run_folder / "result.json").read_text())
     assert (result["task"], result["num_queries"], result["steps"]) == ("my_scene.yaml", 3, 400)
     checkpoint = torch.load(run_folder / "checkpoint.pt", weights_only=True)
-    assert checkpoint["counts"]["demos_injected"] > 0
+    assert checkpoint["progress"]["demos_injected"] > 0
     for policy in ("runs/RUN", "go-to-goal", "via-points", "planner"):
         text = result_of(page, f"roboarm evaluate --task my_scene.yaml --policy {policy}").out
         assert "on my_scene.yaml: 6 test queries" in text
