@@ -52,6 +52,7 @@ import matplotlib.pyplot as plt
 from roboarm_nmp import envs
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.evaluation.evaluate import evaluate
+from roboarm_nmp.policies.export import save_policy
 from roboarm_nmp.training.network_parts import GoalFeatures
 from roboarm_nmp.training.runs import Run
 from roboarm_nmp.utils import flags
@@ -121,12 +122,17 @@ class Clock:
     def start(self):
         self.began = time.perf_counter()
 
+    @contextlib.contextmanager
+    def pause(self):
+        now = time.perf_counter()
+        yield
+        self.paused += time.perf_counter() - now
+
     def evaluate(self, policy, steps, updates):
         """The result of a policy, as of `roboarm_nmp.evaluate`."""
-        now = time.perf_counter()
-        result = evaluate(policy, self.task, queries=self.queries)
-        seconds = now - self.began - self.paused
-        self.paused += time.perf_counter() - now
+        seconds = time.perf_counter() - self.began - self.paused
+        with self.pause():
+            result = evaluate(policy, self.task, queries=self.queries)
         point = {"steps": steps, "updates": updates, "seconds": seconds}
         self.curve.append(point | {"success": result["success_rate"]})
         print(json.dumps(self.curve[-1]), flush=True)
@@ -151,6 +157,10 @@ def train_ours(task, seed, clock, changed):
         started(run, *args)
         clock.start()
 
+    def save_paused(*args, **options):  # for the evaluation
+        with clock.pause():
+            save_policy(*args, **options)
+
     def evaluate_fresh(policy, task, queries):
         (run,) = runs
         steps = max(0, run.step - run.args.learning_starts)
@@ -170,6 +180,7 @@ def train_ours(task, seed, clock, changed):
     with (
         mock.patch.object(Run, "start", start),
         mock.patch("roboarm_nmp.evaluation.evaluate.evaluate", evaluate_fresh),
+        mock.patch("roboarm_nmp.policies.export.save_policy", save_paused),
         contextlib.suppress(Done),
     ):
         runpy.run_path(str(script), run_name="__main__")
