@@ -673,6 +673,8 @@ def _action(action, num_joints):
     try:
         array = np.asarray(action)
     except (TypeError, ValueError, RuntimeError) as error:  # a list in a list, a tensor
+        if hasattr(action, "detach"):  # a tensor with a gradient, or on a GPU
+            return _action(action.detach().cpu().numpy(), num_joints)
         reason = f"{action!r}, no NumPy array: {error}"
         raise _no_action(num_joints, reason) from error
     if np.ma.isMaskedArray(action):

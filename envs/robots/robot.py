@@ -19,6 +19,8 @@ from numpy.typing import ArrayLike
 
 from roboarm_nmp.envs.robots.rotations import matrix, quaternions
 
+DEFAULT_VELOCITY = 1.0
+"""rad/s (or m/s), of joints without a limit, as in MoveIt."""
 # Fields that do not change what an arm is. Limits of trajectories are handled in `fingerprint`.
 NOT_IN_FINGERPRINT = (
     *("urdf", "source", "xml", "described", "datasheet_lower", "datasheet_upper", "urdf_velocity"),

@@ -1,6 +1,7 @@
 """A `Robot` from a URDF, which is untrusted input: everything in it is checked first."""
 
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
@@ -18,7 +19,7 @@ from roboarm_nmp.envs.robots.placements import (
     joint_origin,
     link_steps,
 )
-from roboarm_nmp.envs.robots.robot import Frame, Link, Robot
+from roboarm_nmp.envs.robots.robot import DEFAULT_VELOCITY, Frame, Link, Robot
 from roboarm_nmp.envs.robots.self_collisions import SAMPLES, disabled_pairs, sample_pairs
 from roboarm_nmp.envs.robots.untrusted import RobotError, bullet_indices
 from roboarm_nmp.envs.robots.urdf_tree import MAX_NUMBER, UrdfTree
@@ -198,8 +199,7 @@ def robot_from_urdf(
     links.sort(key=lambda link: (link.frame >= 0, link.index))  # those that do not move come first
     held = [joint for joint in positions if joint in tree.joints]
     frame, rotation, position = placements[end_effector]
-    velocities = [tree.velocity(joint) for joint in joints]
-    urdf_velocity = velocities if min(velocities) > 0 else None
+    urdf_velocity = _urdf_velocity(tree, joints)
     datasheet = _datasheet_limits(tree, joints, bounds, datasheet_limits)
     middle = tuple(bounds.mean(1))
     turn = np.array(base_orientation)
@@ -315,6 +315,21 @@ def _datasheet_limits(tree, joints, bounds, datasheet_limits):
                 f"limits from {least} to {most}"
             )
     return limits
+
+
+def _urdf_velocity(tree, joints):
+    """Limits of the velocity in the URDF (n,), where it has none `DEFAULT_VELOCITY`; None: none."""
+    velocities = [tree.velocity(joint) for joint in joints]
+    without = [joint for joint, limit in zip(joints, velocities, strict=True) if not limit > 0]
+    if len(without) == len(joints):
+        return None
+    if without:
+        warnings.warn(
+            f"{tree.path}: no positive velocity limit of {', '.join(without)}: "
+            f"{DEFAULT_VELOCITY:g} rad/s (or m/s) is assumed",
+            stacklevel=3,
+        )
+    return [limit if limit > 0 else DEFAULT_VELOCITY for limit in velocities]
 
 
 def _motion_limits(tree, name, limits, joints, urdf_limits=None):

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 
 from roboarm_nmp.utils.names import suggest
-from roboarm_nmp.utils.signals import end_with_one_line
+from roboarm_nmp.utils.signals import end_with_one_line, flush_output
 
 TRAINERS = {
     "sac": ("clean_rl_scripts.sac_her_mp", "SAC with HER and demonstrations"),
@@ -86,6 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{needs}: docs/install.md says for which", file=sys.stderr)
         return 1
     finally:
+        flush_output()
         if commands is TRAINERS and {"-h", "--help"} & set(arguments):
             gc.freeze()  # the last collection would search PyTorch's objects: 0.4 s
     return 0

@@ -53,3 +53,11 @@ def test_reader_that_closes_the_output_ends_a_command_without_a_word():
     process.stdout.close()
     assert process.stderr.read() == ""
     assert process.wait(timeout=30) == 141
+
+
+def test_full_disk_of_the_output_ends_a_command_with_one_line():
+    command = [sys.executable, "-m", "roboarm_nmp", "policies"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 1
+    assert done.stderr == "roboarm policies: cannot write its output: No space left on device\n"

@@ -569,11 +569,14 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
     if not h5py.is_hdf5(path):
         raise DatasetError(f"{path}: not an HDF5 file")
     try:
-        with h5py.File(path, "r") as file:
+        # Our files are replaced as a whole, so they need no locks, which not every file system has.
+        with h5py.File(path, "r", locking=False) as file:
             yield file
     except DatasetError:
         raise
     except Exception as error:
+        if "already open for write" in str(error):
+            raise DatasetError(f"{path}: another program is writing it, or was killed") from error
         raise DatasetError(f"{path}: truncated or corrupt HDF5 ({error})") from error
 
 

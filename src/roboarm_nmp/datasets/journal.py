@@ -1,6 +1,5 @@
 """Journals: the results of a long job so far, beside the file that it will write."""
 
-import fcntl
 import json
 import os
 import sys
@@ -11,6 +10,7 @@ from typing import Any
 
 from roboarm_nmp.envs.scenes.primitives import scene_to_json
 from roboarm_nmp.envs.tasks import get_task
+from roboarm_nmp.utils.files import lock_file
 
 VERSION = 4
 
@@ -58,10 +58,8 @@ class Journal:
         scene = scene_to_json(get_task(options["task"]).base_scene)
         header = {"journal": VERSION, **options, "scene": scene}
         self._file = open(path, "a+b", buffering=0)  # noqa: SIM115 (closed by `close`)
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise ValueError(f"{path}: another process is writing to it") from error
+        if not lock_file(self._file, wait=False):
+            raise ValueError(f"{path}: another process is writing to it")
         if not path.exists() or not os.path.samestat(os.fstat(self._file.fileno()), path.stat()):
             raise ValueError(f"{path}: another process has just finished it")
         self._file.seek(0)

@@ -25,7 +25,7 @@ from typing import Literal
 import numpy as np
 
 from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
-from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.robots.robot import DEFAULT_VELOCITY, Robot
 from roboarm_nmp.motions.trajectories import JointTrajectory
 
 DEVIATION = 0.1
@@ -33,8 +33,6 @@ DEVIATION = 0.1
 `TimeOptimalTrajectoryGeneration` (`path_tolerance`)."""
 STEP = 0.01  # s
 MAX_SAMPLES = 1_000_000
-DEFAULT_VELOCITY = 1.0
-"""rad/s (or m/s), of joints without a limit, as in MoveIt."""
 DEFAULT_ACCELERATION = 1.0
 """rad/s^2 (or m/s^2), likewise."""
 LIMIT_TOLERANCE = 0.01

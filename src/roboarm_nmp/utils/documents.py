@@ -131,19 +131,24 @@ def _compose(events, allow_tags):
     """The root `Node` of the only document."""
     anchors: dict[str, Node] = {}
     root = None
+    ended = False
     count = 0
     containers = []  # the lists and dicts around the present event
     counts = []  # how many values came before each of them
     keys = []  # of each: the key whose value comes next, if it is a dict
     for event in events:
         line = event.start_mark.line + 1
-        if isinstance(event, yaml.DocumentStartEvent) and root is not None:
-            raise Mistake(Node("", line), "a second document begins: a file has only one")
+        if isinstance(event, yaml.DocumentStartEvent):
+            ended = root is not None  # `---` may end a file, as `ros2 topic echo` writes it
         if isinstance(event, yaml.CollectionEndEvent):
             keys.pop()
             containers.pop().size = count - counts.pop()
         if not isinstance(event, yaml.NodeEvent):
             continue
+        if ended:
+            if isinstance(event, yaml.ScalarEvent) and not event.value:
+                continue
+            raise Mistake(Node("", line), "a second document begins: a file has only one")
         if isinstance(event, yaml.AliasEvent):
             node = anchors.get(event.anchor)
             alias = f"the alias {shorten(event.anchor)!r}"

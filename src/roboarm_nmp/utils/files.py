@@ -1,14 +1,20 @@
 """Writing files atomically, and checking that they can be written or are undamaged."""
 
 import contextlib
+import errno
 import fcntl
+import functools
 import glob
 import os
+import sys
 import tempfile
 import uuid
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
+
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 def cache_folder() -> Path:
@@ -44,6 +50,33 @@ def write_atomically(path: str | Path, contents: bytes | memoryview) -> None:
         temporary.write_bytes(contents)
 
 
+def lock_file(file: IO[bytes], wait: bool = True) -> bool:
+    """Lock an open file until it is closed. Returns False if another process has it, and `wait` is.
+
+    On a file system without locks (Lustre without `flock`, some NFS) it says so, once, and goes on:
+    two processes must not write the same file there.
+
+    Raises OSError: anything else is wrong.
+    """
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+        _warn_without_locks(str(Path(file.name).absolute().parent))
+    return True
+
+
+@functools.cache
+def _warn_without_locks(folder):
+    print(
+        f"no file locks in {folder}: do not let two processes write the same file there",
+        file=sys.stderr,
+    )
+
+
 @contextlib.contextmanager
 def new_contents(path: str | Path) -> Iterator[Path]:
     """A context whose value is the path of an empty file, which replaces `path` at its end.
@@ -56,7 +89,7 @@ def new_contents(path: str | Path) -> Iterator[Path]:
     while True:
         temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
         lock = open(temporary, "wb")  # noqa: SIM115 (closed below)
-        fcntl.flock(lock, fcntl.LOCK_EX)
+        lock_file(lock)
         if temporary.exists():  # otherwise another process took it for a leftover before the lock
             break
         lock.close()

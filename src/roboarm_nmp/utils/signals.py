@@ -7,6 +7,7 @@ A command calls `end_with_one_line` first, and again as soon as another advice h
     end_with_one_line("the same command continues")
 """
 
+import errno
 import os
 import select
 import signal
@@ -47,10 +48,28 @@ def end_with_one_line(advice: str) -> None:
             exit_interrupted(error, advice)
         if isinstance(error, BrokenPipeError) and _output_is_closed():
             sys.exit(128 + signal.SIGPIPE)
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
+            _end_without_output(error)
         sys.__excepthook__(kind, error, trace)
 
     signal.signal(signal.SIGTERM, terminate)
     sys.excepthook = hook
+
+
+def flush_output() -> None:
+    """Write what is left of stdout; if its disk is full, end the program with a line."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        _end_without_output(error)
+
+
+def _end_without_output(error: OSError) -> NoReturn:
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    print(f"{program()}: cannot write its output: {error.strerror}", file=sys.stderr)
+    sys.exit(1)
 
 
 def _output_is_closed():

@@ -105,6 +105,13 @@ def test_joints_limits_and_held_joints_are_those_of_the_file(arm):
     assert (leader, multiplier, offset) == (0, -0.5, 0.2)
 
 
+def test_joint_without_a_velocity_limit_does_not_drop_the_limits_of_others(urdf):
+    elements = ARM.replace('velocity="2"', 'velocity="0"', 1)
+    with pytest.warns(UserWarning, match="no positive velocity limit of .*: 1 rad/s"):
+        robot = robot_from_urdf(urdf(elements), end_effector="tool", fixed={"grip": 0.02})
+    assert sorted(robot.velocity.tolist()) == [1, 2, 2]
+
+
 def test_forward_kinematics_agree_with_pybullet(arm):
     world = World(Scene(table=None, floor=None, robot=arm), drawn=False)
     for configuration in np.random.default_rng(0).uniform(-1.5, 1.5, (50, 3)):
