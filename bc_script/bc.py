@@ -15,7 +15,7 @@ import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -242,7 +242,7 @@ if __name__ == "__main__":
         "num_points": args.num_points,
     }
     with errors_of("--encoder"):
-        env = roboarm_nmp.make(args.task, **env_arguments)  # for its spaces
+        env: Any = roboarm_nmp.make(args.task, **env_arguments)  # for its spaces
 
     # ALGO LOGIC: data
     data = [torch.as_tensor(array, device=device) for array in transitions(demos, args.goal_type)]

@@ -17,7 +17,7 @@ import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -368,7 +368,7 @@ if __name__ == "__main__":
         "link_distances": True,
     }
     with errors_of("--encoder"):
-        env = roboarm_nmp.make(args.task, **env_arguments)
+        env: Any = roboarm_nmp.make(args.task, **env_arguments)
     safety_filter = SafetyFilter(args.safety_margin, args.escape)
 
     # ALGO LOGIC: network and optimiser

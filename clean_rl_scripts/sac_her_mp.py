@@ -15,7 +15,7 @@ import os
 import time
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -371,7 +371,7 @@ def env_arguments(args):
     return arguments | {"append_link_distances": args.link_distances}
 
 
-def make_env(args, demos=None):
+def make_env(args, demos=None) -> Any:
     """An environment; with demonstrations, its episodes are their queries."""
     rules = {"horizon": args.horizon, "stop_on_collision": args.stop_on_collision}
     env = roboarm_nmp.make(args.task, **env_arguments(args), **rules)
@@ -497,15 +497,16 @@ class SAC:
 
 if __name__ == "__main__":
     # SHARED: checks, environments
-    args = parse_args(Args, may_change={"total_timesteps", "test_queries", "stop_at_success"})
+    args: Any = parse_args(Args, may_change={"total_timesteps", "test_queries", "stop_at_success"})
     device = seed_torch(args)
     validation, test = load_task(args)
-    if args.demo_prob is None and (args.demos or args.bc_weight > 0):
+    uses_demos = args.demo_prob is not None
+    if not uses_demos and (args.demos or args.bc_weight > 0):
         fail("--demos and --bc-weight go with --demo-prob")
     with errors_of("--encoder, --geometry-source, --link-distances"):
         env = make_env(args)  # for its spaces and rewards
-    demos = None
-    if args.demo_prob is not None:
+    demos: Any = None
+    if uses_demos:
         with errors_of("--demo-prob"):
             demos = load_demos_for(env, args.demos, args.task)
     # END SHARED
@@ -532,7 +533,7 @@ if __name__ == "__main__":
         for demo in progress_bar(demos, "demonstrations", transient=True):
             demo_buffer.add_episode(demo_transitions(demo, env))
     observations, infos = envs.reset(seed=reset_seeds(args, run.step))
-    demo_numbers = infos.get("demo")
+    demo_numbers: Any = infos.get("demo")
     returns = np.zeros(args.num_envs)
     losses = {}
     logged = 0.0
@@ -591,14 +592,14 @@ if __name__ == "__main__":
         returns += rewards
         for i in np.flatnonzero(ended):
             success = infos["final_info"]["is_success"][i]
-            if demos is not None and not success and rng.random() < args.demo_prob:
+            if uses_demos and not success and rng.random() < args.demo_prob:
                 buffer.add_episode(demo_transitions(demos[int(demo_numbers[i])], env))
                 progress["demos_injected"] += 1
             steps = infos["final_info"]["elapsed_steps"][i]
             episode = {"episodic_return": returns[i], "episodic_length": steps, "success": success}
             run.log({f"charts/{name}": value for name, value in episode.items()})
             returns[i] = 0.0
-        if demos is not None and ended.any():
+        if uses_demos and ended.any():
             demo_numbers = np.where(ended, infos["demo"], demo_numbers)
         observations = next_observations
         # END SHARED

@@ -25,7 +25,7 @@ def next_joint_angles(angles, end_effector, goal):
         "desired_goal": (2 * goal - HIGH - LOW) / (HIGH - LOW),
     }
     batch = {name: values[None].astype(np.float32) for name, values in inputs.items()}
-    [action] = policy.run(["action"], batch)[0]
+    [action] = np.asarray(policy.run(["action"], batch)[0])
     action = action * min(1.0, MAX_STEP / np.linalg.norm(action))
     return angles + action * (HIGH - LOW) / 2
 

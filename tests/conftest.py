@@ -12,7 +12,7 @@ import torch
 from trainers import GPU
 
 from roboarm_nmp.datasets.demonstrations import load_demos, write_demos
-from roboarm_nmp.training import protocol
+from roboarm_nmp.evaluation import evaluate
 
 # As many threads as a trainer has in a process of its own, whatever benchmarks set when they are
 # imported: results are compared bit for bit.
@@ -111,10 +111,15 @@ def few_demos(tmp_path_factory):
 
 @pytest.fixture
 def short_episodes(monkeypatch):
-    """Evaluations are over sooner, also of trainers that have no --horizon."""
-    make_envs = protocol.make_envs
-    short = {"horizon": 30}
-    monkeypatch.setattr(protocol, "make_envs", lambda *args, **kw: make_envs(*args, **kw | short))
+    """Evaluations are over sooner: their episodes have at most 30 steps."""
+    make = evaluate._Job.make
+
+    def make_short(job, **options):
+        env, begin = make(job, **options)
+        env.unwrapped.horizon = 30
+        return env, begin
+
+    monkeypatch.setattr(evaluate._Job, "make", make_short)
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ def flags(trainer):
 
 def num_updates(state):
     """Of a checkpoint."""
-    return state["counts"]["updates"] if "counts" in state else state["progress"]["step"]
+    return state["progress"].get("updates", state["counts"]["step"])
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)

@@ -3,18 +3,19 @@
 import numpy as np
 import pytest
 import torch
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from scipy.spatial.transform import Rotation
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from trainers import ONE_EVALUATION, PATHS, load, panda_env, run_here, run_script
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.demonstrations import Demos, load_demos
-from roboarm_nmp.datasets.episodes import demo_transitions
+from roboarm_nmp.datasets.episodes import DemoQueriesWrapper, demo_transitions, transition
 from roboarm_nmp.datasets.format import QueryScenes
 from roboarm_nmp.demo_generation import collect
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.training import cuda_graphs
-from roboarm_nmp.training.network_parts import JacobianTranspose
+from roboarm_nmp.training.network_parts import GoalFeatures, JacobianTranspose
 
 sac = load("sac_her_mp")
 
@@ -37,8 +38,7 @@ def test_network_inputs(goal_type):
     observation = np.hstack([state, position])
     tensors = torch.tensor(observation).float(), torch.tensor(goal).float()
     for jacobian in (True, False):
-        args = sac.Args(goal_type=goal_type, jacobian=jacobian)
-        features = sac.Features(args, panda_env(goal_type))
+        features = GoalFeatures(panda_env(goal_type), jacobian=jacobian)
         inputs, added = features(*tensors).numpy(), []
         if jacobian and to_goal:
             given = tensors[0][:, :7], tensors[0][:, 7:], torch.tensor(to_goal[0]).float()
@@ -47,14 +47,13 @@ def test_network_inputs(goal_type):
         assert inputs.shape == (5, features.size)
         numbers = np.hstack([*expected, *to_goal, *added, *to_goal_state])
         np.testing.assert_allclose(inputs, numbers, atol=1e-5)
-    plain = sac.Features(sac.Args(goal_type=goal_type, plain_networks=True), panda_env(goal_type))
+    plain = GoalFeatures(panda_env(goal_type), plain=True)
     np.testing.assert_array_equal(plain(*tensors), torch.cat(tensors, dim=1))
 
 
 def test_network_inputs_of_goal_poses():
     env = panda_env("pose")
-    features = sac.Features(sac.Args(goal_type="pose"), env)
-    without = sac.Features(sac.Args(goal_type="pose", jacobian=False), env)
+    features, without = GoalFeatures(env), GoalFeatures(env, jacobian=False)
     configurations = np.random.default_rng(0).uniform(PANDA.lower, PANDA.upper, (2, 7))
     here, there = PANDA.end_effector_pose(configurations)
     observation = np.hstack([PANDA.normalise(configurations[0]), here])
@@ -89,9 +88,14 @@ def episode(length, offset, env):
     ]
 
 
+def make_buffer(env, capacity, her_probability, her_exponent=1.0):
+    args = sac.Args(her_probability=her_probability, her_exponent=her_exponent)
+    return sac.HerReplayBuffer(env, capacity, args, np.random.default_rng(0))
+
+
 def test_relabelled_goals_are_reached_later_in_the_same_episode():
     env = envs.make("no_obstacles")
-    buffer = sac.HerReplayBuffer(env, 100, 1.0, np.random.default_rng(0))
+    buffer = make_buffer(env, 100, 1.0)
     buffer.add_episode(episode(4, 0, env))
     buffer.add_episode(episode(6, 100, env))
     batch = buffer.sample(4000)
@@ -116,7 +120,7 @@ def test_relabelled_goals_are_reached_later_in_the_same_episode():
 
 def test_goals_reached_soon_are_preferred():
     env = envs.make("no_obstacles")
-    buffer = sac.HerReplayBuffer(env, 100, 1.0, np.random.default_rng(0), her_exponent=2.0)
+    buffer = make_buffer(env, 100, 1.0, her_exponent=2.0)
     buffer.add_episode(episode(6, 0, env))
     batch = buffer.sample(20_000)
     goal = batch["desired_goal"][batch["next_achieved_goal"][:, 0] == 0, 0].astype(int)
@@ -127,7 +131,7 @@ def test_goals_reached_soon_are_preferred():
 
 def test_share_of_relabelled_goals():
     env = envs.make("no_obstacles")
-    buffer = sac.HerReplayBuffer(env, 100, 0.8, np.random.default_rng(0))
+    buffer = make_buffer(env, 100, 0.8)
     buffer.add_episode(episode(20, 0, env))
     goals = buffer.sample(10_000)["desired_goal"][:, 0]
     assert abs((goals != -5).mean() - 0.8) < 0.02
@@ -136,7 +140,7 @@ def test_share_of_relabelled_goals():
 def test_collisions_end_episodes_only_with_stop_on_collision():
     for stop in (False, True):
         env = envs.make("no_obstacles", stop_on_collision=stop)
-        buffer = sac.HerReplayBuffer(env, 10, 0.0, np.random.default_rng(0))
+        buffer = make_buffer(env, 10, 0.0)
         buffer.add_episode(episode(3, 0, env))
         batch = buffer.sample(100)
         collided = batch["next_achieved_goal"][:, 0] == 1
@@ -146,7 +150,7 @@ def test_collisions_end_episodes_only_with_stop_on_collision():
 
 def test_ring_overwrites_the_oldest_and_keeps_episodes_apart():
     env = envs.make("no_obstacles")
-    buffer = sac.HerReplayBuffer(env, 10, 1.0, np.random.default_rng(0))
+    buffer = make_buffer(env, 10, 1.0)
     for offset in (0, 100, 200):
         buffer.add_episode(episode(4, offset, env))  # the third wraps around over half the first
     assert buffer.size == 10
@@ -209,19 +213,19 @@ def test_demonstration_as_transitions_by_hand(goal_type):
     else:
         reached = np.linalg.norm(positions - goal_position, axis=1) <= 0.02
     assert len(episode) == np.argmax(reached) < len(demo.actions)  # cut where the goal is reached
-    for t, transition in enumerate(episode):
+    for t, entry in enumerate(episode):
         observation = np.concatenate([demo.states[t], positions[t]])
-        np.testing.assert_allclose(transition["observation"], observation, atol=1e-6)
+        np.testing.assert_allclose(entry["observation"], observation, atol=1e-6)
         observation = np.concatenate([demo.states[t + 1], positions[t + 1]])
-        np.testing.assert_allclose(transition["next_observation"], observation, atol=1e-6)
-        np.testing.assert_array_equal(transition["action"], demo.actions[t])
-        assert not transition["collision"]
+        np.testing.assert_allclose(entry["next_observation"], observation, atol=1e-6)
+        np.testing.assert_array_equal(entry["action"], demo.actions[t])
+        assert not entry["collision"]
         goal = {
             "ee": goal_position,
             "config": PANDA.normalise(demo.goal),
             "combined": np.concatenate([PANDA.normalise(demo.goal), goal_position]),
         }[goal_type]
-        np.testing.assert_allclose(transition["desired_goal"], goal, atol=1e-6)
+        np.testing.assert_allclose(entry["desired_goal"], goal, atol=1e-6)
     env.action_mode = "subgoal"
     sub_goals = demo_transitions(demo, env)
     np.testing.assert_allclose(sub_goals[3]["action"], demo.states[4], atol=1e-6)
@@ -236,42 +240,77 @@ def demo_file(tmp_path_factory):
     return path
 
 
-def test_failed_episodes_on_the_demonstrations_queries_inject_these(tmp_path, demo_file):
-    demos = load_demos(demo_file)
-    flags = ["--demo-prob", "0.4", "--demos", str(demo_file)]
-    run = run_script("sac_her_mp", tmp_path, *flags)
+@pytest.mark.parametrize("vector_env", [SyncVectorEnv, AsyncVectorEnv])
+def test_transitions_are_those_of_single_environments_and_failures_inject_demonstrations(
+    tmp_path, demo_file, vector_env, monkeypatch, short_episodes
+):
+    """Also at an evaluation, where all episodes end: every 60 steps, 20 of each environment."""
+    taken = []
+
+    def make_envs(makers, **options):
+        if vector_env is AsyncVectorEnv:
+            options["context"] = "spawn"
+        made = vector_env(makers, **options)
+        step = made.step
+        made.step = lambda actions: taken.append(actions) or step(actions)
+        return made
+
+    monkeypatch.setattr("gymnasium.vector.SyncVectorEnv", make_envs)
+    flags = "--total-timesteps 120 --eval-every 60 --horizon 8 --updates-per-step 0"
+    flags += " --demo-prob 0.4 --goal-type combined --her-probability 0"
+    run = run_script("sac_her_mp", tmp_path, *flags.split(), "--demos", str(demo_file))
     state = torch.load(run / "checkpoint.pt", weights_only=True)
-    arrays = {name: array.numpy() for name, array in state["buffer"]["arrays"].items()}
-    events = EventAccumulator(str(run)).Reload()
-    first = np.concatenate([[True], arrays["remaining"][:-1] == 0])
-    observation, goal = arrays["observation"][first], arrays["desired_goal"][first]
-    starts = PANDA.normalise(demos.start)
-    query = np.array([np.abs(starts - row[:7]).max(1).argmin() for row in observation])
-    assert np.abs(starts[query] - observation[:, :7]).max() < 1e-3  # all on the demos' queries
-    np.testing.assert_allclose(goal, PANDA.forward_kinematics(demos.goal)[query], atol=1e-6)
-    injected = [
-        np.abs(action - demos[q].actions[0]).max() < 1e-6
-        for q, action in zip(query, arrays["action"][first], strict=True)
-    ]
-    failures = len(events.Scalars("charts/episodic_length"))  # so short a run never succeeds
-    assert events.Scalars("charts/success")[-1].value == 0
-    assert sum(injected) == events.Scalars("charts/demos_injected")[-1].value
-    assert 0 < sum(injected) < failures
+
+    demos, rng = load_demos(demo_file), np.random.default_rng(1)
+    env = envs.make("no_obstacles", goal_type="combined")
+    expected, number_ended, injected = make_buffer(env, 1000, 0.0), 0, 0
+    single = [envs.make("no_obstacles", goal_type="combined", horizon=8) for _ in range(3)]
+    single = [DemoQueriesWrapper(one, demos) for one in single]
+    for first in (0, 20):
+        seeds = sac.reset_seeds(sac.Args(num_envs=3), 3 * first)
+        now = [one.reset(seed=seed) for one, seed in zip(single, seeds, strict=True)]
+        episodes = [[], [], []]
+        for actions in taken[first : first + 20]:
+            ended = []
+            for i, one in enumerate(single):
+                observation, info = now[i]
+                after, _, _, truncated, later = one.step(actions[i])
+                entry = transition(observation, actions[i], after, later["collision"])
+                episodes[i].append(entry)
+                now[i] = after, info
+                if truncated:
+                    expected.add_episode(episodes[i])
+                    episodes[i], now[i] = [], one.reset()
+                    ended.append(demos[info["demo"]])
+            for demo in ended:
+                number_ended += 1
+                if rng.random() < 0.4:
+                    injected += 1
+                    expected.add_episode(demo_transitions(demo, env))
+        for episode in episodes:
+            expected.add_episode(episode)
+    assert len(taken) == 40 and 0 < injected < number_ended == 12
+    assert state["progress"]["demos_injected"] == injected
+    arrays = expected.state_dict()["arrays"]
+    assert arrays.keys() == state["buffer"]["arrays"].keys()
+    for name, array in arrays.items():
+        assert torch.equal(array, state["buffer"]["arrays"][name]), name
+    events = EventAccumulator(str(run)).Reload().Scalars("charts/episodic_return")
+    assert [event.value for event in events] == [-8] * 12
 
 
-CLONING = ["--demo-prob", "1", "--bc-weight", "5", "--demo-batch-size", "6"]
+CLONING = ["--demo-prob", "1", "--bc-weight", "5"]
 
 
 def test_cloning_adds_demonstrated_transitions_to_every_batch(tmp_path, demo_file, monkeypatch):
-    batches, graphed = [], cuda_graphs.graphed
+    calls = {"explore": [], "update_critics": [], "update_actor": []}
 
-    def recorded(function, args, device):
-        def call(data, *options):
-            batches.append(data)
-            return function(data, *options)
+    def recorded(function, device):
+        def call(data):
+            calls[function.__name__].append(data)
+            return function(data)
 
-        is_update = function.__name__ == "update"
-        return call if is_update else graphed(function, args, device)
+        return call
 
     monkeypatch.setattr(cuda_graphs, "graphed", recorded)
     # A goal is reached where it is the last of its episode: none is relabelled.
@@ -282,17 +321,17 @@ def test_cloning_adds_demonstrated_transitions_to_every_batch(tmp_path, demo_fil
     entries = [(transition, episode[-1]) for episode in episodes for transition in episode]
     seen, names = set(), ("observation", "action", "next_observation", "desired_goal")
     stacked = {name: np.float32([one[name] for one, _ in entries]) for name in names}
-    assert len(batches) == 40
-    for batch in batches:
-        assert all(len(value) == 16 + 6 for value in batch.values())
-        rows = {name: value[-6:].numpy() for name, value in batch.items()}
-        for i in range(6):
+    assert len(calls["update_critics"]) == 40 and len(calls["update_actor"]) == 20
+    for batch in calls["update_critics"][::10]:
+        assert all(len(value) == 16 + 128 for value in batch.values())
+        rows = {name: value[-128:].numpy() for name, value in batch.items()}
+        for i in range(128):
             alike = [(stacked[name] == rows[name][i]).all(1) for name in names]
             (which,) = np.flatnonzero(np.all(alike, axis=0))
             seen.add(which)
             one, last = entries[which]
             assert rows["terminated"][i] == (one is last) and rows["reward"][i] == (one is last) - 1
-    assert len(seen) > 0.5 * min(len(entries), 240)  # all of them, not the first alone
+    assert len(seen) > 0.5 * min(len(entries), 4 * 128)  # all of them, not the first alone
 
 
 def test_resumed_run_with_cloning_is_the_same(tmp_path, demo_file):

@@ -68,7 +68,7 @@ def rows(trainer):
 @pytest.mark.parametrize(
     ("text", "name", "distribution"),
     [
-        ("policy-lr=1e-6..5e-3:log", "policy-lr", FloatDistribution(1e-6, 5e-3, log=True)),
+        ("learning-rate=1e-6..5e-3:log", "learning-rate", FloatDistribution(1e-6, 5e-3, log=True)),
         ("--gamma=0.9..1", "gamma", FloatDistribution(0.9, 1.0)),
         ("hidden_size=64..512:log", "hidden-size", IntDistribution(64, 512, log=True)),
         ("target-entropy=-14..-7", "target-entropy", IntDistribution(-14, -7)),

@@ -1,5 +1,6 @@
 """All trainers of policies: their files, interrupted and resumed runs, bad flags."""
 
+import io
 import json
 import math
 import os
@@ -9,6 +10,7 @@ import time
 
 import pytest
 import torch
+from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from trainers import (
     GPU,
@@ -25,7 +27,9 @@ from trainers import (
 from roboarm_nmp import envs
 from roboarm_nmp.evaluation.evaluate import evaluate
 from roboarm_nmp.networks.network_file import load_network
-from roboarm_nmp.training import protocol, runs
+from roboarm_nmp.training import runs
+from roboarm_nmp.training.final_test import RESULTS
+from roboarm_nmp.utils.signals import Terminated
 
 
 @pytest.fixture(params=TRAINERS)
@@ -35,7 +39,7 @@ def trainer(request):
 
 FINISHED = {
     "sac_her_mp": ["--goal-type", "combined", "--velocities"],
-    "td3_her_mp": ["--goal-type", "config", "--action-mode", "subgoal", "--updates-per-step", "3"],
+    "td3_her_mp": ["--goal-type", "config", "--action-mode", "subgoal", "--capture-video"],
     "bc": ["--goal-type", "pose", "--policy-average", "0.01"],
 }
 
@@ -82,26 +86,36 @@ def test_run_writes_result_policy_and_tensorboard_events(finished_run, trainer):
     events = EventAccumulator(str(finished_run))
     events.Reload()
     scalars = set(events.Tags()["scalars"])
-    if trainer == "td3_her_mp":  # only its updates are as many as are logged
-        for tag in ("qf1_values", "qf1_loss", "qf2_loss", "qf_loss", "actor_loss"):
-            assert math.isfinite(events.Scalars(f"losses/{tag}")[-1].value)
-        assert events.Scalars("charts/SPS")[-1].value > 0
+    losses = ["negative_log_likelihood"]
     if trainer != "bc":
-        for tag in ("episodic_return", "episodic_length", "success"):
-            assert f"charts/{tag}" in scalars
-        assert "charts/demos_injected" not in scalars
-    for tag in ("success_rate", "collision_free_success_rate", "episode_length", "collision_rate"):
+        losses = ["qf1_values", "qf_loss", "actor_loss"]
+        assert {
+            f"charts/{tag}" for tag in ("episodic_return", "episodic_length", "success")
+        } <= scalars
+    for tag in losses:
+        assert math.isfinite(events.Scalars(f"losses/{tag}")[0].value)
+    assert events.Scalars("charts/SPS")[0].value > 0
+    for tag in ("success_rate", "collision_free_success_rate", "collision_rate"):
         assert [event.step for event in events.Scalars(f"eval/{tag}")] == [300, 600]
-    assert "eval/rollout" in events.Tags()["images"]
+    gifs = {path.name for path in finished_run.glob("*.gif")}
+    if trainer == "td3_her_mp":  # with --capture-video
+        assert gifs == {"eval_episode_300.gif", "eval_episode_600.gif"}
+        images = events.Images("eval/episode")
+        assert [image.step for image in images] == [300, 600]
+        with Image.open(io.BytesIO(images[-1].encoded_image_string)) as gif:
+            assert gif.n_frames > 1 and gif.size == (images[-1].width, images[-1].height)
+    else:
+        assert not gifs
     assert "hyperparameters/text_summary" in events.Tags()["tensors"]
 
 
 def test_saved_policy_is_the_running_average_and_acts_without_the_script(finished_run, trainer):
     policy = load_network(finished_run / "policy.onnx")
-    assert policy.metadata["kind"] == "policy" and policy.metadata["task"] == "no_obstacles"
+    metadata = {"kind": "policy", "task": "no_obstacles", "script": trainer, "seed": 1}
+    assert metadata.items() <= policy.metadata.items() and policy.metadata["step"] in (300, 600)
     env = envs.make(policy.metadata["task"], **policy.metadata["env"])
     observation, _ = env.reset(seed=0)
-    inputs = protocol.stack([observation], "cpu")
+    inputs = {name: torch.tensor(value[None]) for name, value in observation.items()}
     action = policy(**inputs)
     limit = 0.06 if "--action-mode" not in FINISHED[trainer] else 1.0
     assert action.shape == (1, 7) and action.abs().max() <= limit
@@ -168,10 +182,9 @@ def test_signal_between_evaluations_keeps_the_transitions_of_running_episodes(
     advance = runs.Run.advance
 
     def advance_and_signal(run, count=1):
-        step = advance(run, count)
-        if step == 351:
+        advance(run, count)
+        if run.step == 351:
             os.kill(os.getpid(), signal.SIGTERM)
-        return step
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
         patch.setattr(runs.Run, "advance", advance_and_signal)
@@ -179,7 +192,7 @@ def test_signal_between_evaluations_keeps_the_transitions_of_running_episodes(
     assert end.value.code == 143
     (run,) = tmp_path.iterdir()
     state = torch.load(run / "checkpoint.pt", weights_only=True)
-    assert state["progress"]["step"] == len(state["buffer"]["arrays"]["remaining"]) == 351
+    assert state["counts"]["step"] == len(state["buffer"]["arrays"]["remaining"]) == 351
     run_here(PATHS["sac_her_mp"], "--resume", run)
     assert json.loads((run / "result.json").read_text())["steps"] == 600
 
@@ -191,10 +204,9 @@ def test_evaluation_that_a_signal_ends_is_repeated_by_the_resumed_run(
         os.kill(os.getpid(), signal.SIGTERM)
         raise AssertionError("the evaluation went on")
 
-    with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
-        patch.setattr(protocol, "evaluate", interrupted_evaluation)
+    with monkeypatch.context() as patch, pytest.raises(Terminated):
+        patch.setattr("roboarm_nmp.evaluation.evaluate.evaluate", interrupted_evaluation)
         run_script("bc", tmp_path, *FINISHED["bc"])
-    assert end.value.code == 143
     (run,) = tmp_path.iterdir()
     assert not (run / "policy.onnx").exists()
     run_here(PATHS["bc"], "--resume", run)
@@ -202,14 +214,15 @@ def test_evaluation_that_a_signal_ends_is_repeated_by_the_resumed_run(
 
 
 def test_run_stops_at_a_success_rate(tmp_path, monkeypatch):
-    success = {"success_rate": 1.0, "collision_free_success_rate": 1.0}
-    monkeypatch.setattr(protocol, "evaluate", lambda *_, **__: success)
-    run = run_script("sac_her_mp", tmp_path, "--updates-per-step", "0", "--stop-at-success", "1.0")
+    success = dict.fromkeys(RESULTS, 1.0)
+    monkeypatch.setattr("roboarm_nmp.evaluation.evaluate.evaluate", lambda *_, **__: success)
+    flags = ["--updates-per-step", "0", "--stop-at-success", "1.0", "--test-queries", "0"]
+    run = run_script("sac_her_mp", tmp_path, *flags)
     assert json.loads((run / "result.json").read_text())["steps"] == 300
 
 
 def test_diverged_run_ends(tmp_path):
-    with pytest.raises(FloatingPointError, match="the policy's actions are no longer finite"):
+    with pytest.raises(FloatingPointError, match="the parameters of `actor` are no longer finite"):
         run_here(*command("bc", tmp_path, "--learning-rate", "1e30")[1:])
     assert not list(tmp_path.glob("*/policy.onnx")) and not list(tmp_path.glob("*/checkpoint.pt"))
 
@@ -220,7 +233,7 @@ def test_diverged_run_ends(tmp_path):
         (["--task", "walls"], "unknown task 'walls': did you mean wall?"),
         (["--task", "narrow_shelves"], "narrow_shelves is for testing only"),
         (["--demo-prob", "1", "--velocities"], "demonstrations have no velocities"),
-        (["--demos", "demos.h5"], "--demos goes with --demo-prob"),
+        (["--demos", "demos.h5"], "--demos and --bc-weight go with --demo-prob"),
         (["--link-distances"], "--link-distances: link_distances needs a geometry_source"),
     ],
 )

@@ -8,7 +8,7 @@ from roboarm_nmp.datasets.queries import Query, load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.evaluation import rollout as module
-from roboarm_nmp.evaluation.rollout import render_strip, rollout, rollouts
+from roboarm_nmp.evaluation.rollout import render_steps, rollout
 from roboarm_nmp.policies.registry import make_policy
 
 BENT = np.array([0.0, -0.3, 0.0, -1.8, 0.0, 1.6, 0.0], np.float32)
@@ -61,28 +61,6 @@ def test_start_at_the_goal_and_a_policy_that_gives_up_make_no_step(env):
         assert trajectory.states.shape == (1, 7) and trajectory.actions.shape == (0, 7)
 
 
-def test_episodes_at_once_are_those_of_single_rollouts():
-    queries = [*load_queries("wall", "validation")[:3], Query(BENT, BENT, Scene())]
-    several = [envs.make("wall", horizon=60) for _ in range(2)]
-    together = []
-
-    def predict(policies, observations):
-        assert len(policies) == len(observations)
-        together.append(len(policies))
-
-    def begin(env, number):
-        return straight(queries[number])
-
-    trajectories = list(rollouts(several, queries, begin, predict))
-    alone = [rollout(several[0], query, straight(query)) for query in queries]
-    assert sorted(map(len, trajectories)) == sorted(map(len, alone))
-    for trajectory in trajectories:
-        assert any(np.array_equal(trajectory.states, other.states) for other in alone)
-    assert max(together) == 2 and sum(together) == sum(map(len, alone))
-    for env in several:
-        env.close()
-
-
 def test_replay_renders_what_the_rollout_went_through():
     env = envs.make("wall", horizon=20, render_mode="rgb_array", render_size=(64, 48))
     query = load_queries("wall", "validation")[1]
@@ -97,8 +75,8 @@ def test_replay_renders_what_the_rollout_went_through():
     trajectory = rollout(env, query, rendering)
     images.append(env.render())
     steps = [0, 7, 7, len(trajectory)]
-    strip = render_strip(env, query, trajectory.actions, steps)
-    assert np.array_equal(strip, np.concatenate([images[step] for step in steps], axis=1))
+    rendered = render_steps(env, query, trajectory.actions, steps)
+    assert np.array_equal(rendered, [images[step] for step in steps])
     assert not np.array_equal(images[0], images[-1])
     env.close()
 

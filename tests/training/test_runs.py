@@ -1,9 +1,8 @@
-"""training/runs.py: flags, checkpoints, logs, signals. (Whole runs: test_trainers.py.)"""
+"""training/arguments.py and runs.py: flags, checkpoints, logs, signals."""
 
 import contextlib
 import io
 import json
-import math
 import re
 import signal
 import subprocess
@@ -19,11 +18,18 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from roboarm_nmp.training import runs
+from roboarm_nmp.training.arguments import parse_args
+from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.files import new_contents
 
 
 @dataclass
-class Args(runs.RunFlags):
+class Args:
+    seed: flags.Seed = 1
+    runs_dir: Path = Path("runs")
+    resume: Path | None = None
+    device: str = "cpu"
+    track: bool = False
     data: Path | None = None
     files: tuple[Path, ...] = ()
     radii: tuple[float, float] = (0.1, 0.2)
@@ -44,20 +50,25 @@ def restored(monkeypatch):
 
 @pytest.fixture
 def parse(monkeypatch):
-    def parse(*flags):
+    def parse(*flags, kind=Args):
         monkeypatch.setattr("sys.argv", ["trainer.py", *map(str, flags)])
-        return runs.parse_args(Args, may_change={"steps", "data"})
+        return parse_args(kind, may_change={"steps", "data"})
 
     return parse
+
+
+def folder_of(args, name="wall"):
+    """The folder of a new or a resumed run."""
+    return runs.Run(args, name, {}).folder
 
 
 def test_flags_are_restored_by_resume(parse, tmp_path):
     flags = ["--runs-dir", tmp_path, "--data", "a.h5", "--files", "b.h5", "c.h5", "--name", "x"]
     args = parse(*flags, "--radii", "0.3", "0.5")
-    run = runs.run_folder(args, "wall")
+    run = folder_of(args)
     assert run.parent == tmp_path and run.name.startswith("wall__trainer__1__")
     again = parse("--resume", run)
-    assert again.resume == run == runs.run_folder(again, "wall")
+    assert again.resume == run == folder_of(again)
     args.resume = run
     assert again == args
     assert isinstance(again.data, Path) and all(isinstance(file, Path) for file in again.files)
@@ -66,13 +77,13 @@ def test_flags_are_restored_by_resume(parse, tmp_path):
 
 
 def test_resuming_with_another_flag_is_rejected(parse, tmp_path):
-    run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
+    run = folder_of(parse("--runs-dir", tmp_path))
     with pytest.raises(SystemExit, match="--seed is 2 now, the run had 1; --name is 'z'"):
         parse("--resume", run, "--seed", "2", "--name", "z")
 
 
 def test_run_without_a_newer_flag_resumes_with_its_default(parse, tmp_path):
-    run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
+    run = folder_of(parse("--runs-dir", tmp_path))
     saved = json.loads((run / "args.json").read_text())
     del saved["radii"]
     (run / "args.json").write_text(json.dumps(saved | {"a_flag_that_was": 3}))
@@ -83,7 +94,7 @@ def test_run_without_a_newer_flag_resumes_with_its_default(parse, tmp_path):
 
 def test_runs_of_the_same_second_have_their_own_folders(parse, tmp_path, monkeypatch):
     monkeypatch.setattr("time.time", lambda: 1_795_000_000.0)
-    names = [runs.run_folder(parse("--runs-dir", tmp_path), "wall").name for _ in range(3)]
+    names = [folder_of(parse("--runs-dir", tmp_path)).name for _ in range(3)]
     first = "wall__trainer__1__1795000000"
     assert names == [first, f"{first}_2", f"{first}_3"]
 
@@ -108,9 +119,8 @@ def test_resumed_run_keeps_its_choice_of_bfloat16(parse, tmp_path, monkeypatch):
 
     def begin(supported, *flags):
         monkeypatch.setattr("torch.cpu._is_avx512_bf16_supported", lambda: supported)
-        monkeypatch.setattr("sys.argv", ["trainer.py", *map(str, flags)])
-        args = runs.parse_args(WithBf16)
-        return args.bf16, runs.run_folder(args, "wall")
+        args = parse(*flags, kind=WithBf16)
+        return args.bf16, folder_of(args)
 
     for number, supported in enumerate((False, True)):
         bf16, run = begin(supported, "--runs-dir", tmp_path / str(number))
@@ -127,7 +137,7 @@ def parts():
         "optimizer": torch.optim.Adam(model.parameters(), lr=0.1, fused=True),
         "alpha": torch.zeros(1, requires_grad=True),
         "rng": np.random.default_rng(0),
-        "counts": {"updates": 0, "best": {}},
+        "counts_of_mine": {"updates": 0, "best": {}},
     }
 
 
@@ -140,35 +150,55 @@ def learn(parts):
     parts["optimizer"].step()
     with torch.no_grad():
         parts["alpha"] += 1
-    parts["counts"]["updates"] += 1
-    parts["counts"]["best"] = {"loss": loss.item()}
+    parts["counts_of_mine"]["updates"] += 1
+    parts["counts_of_mine"]["best"] = {"loss": loss.item()}
     return loss.item()
 
 
-def test_checkpoint_restores_every_part(parse, tmp_path):
-    args = parse("--runs-dir", tmp_path)
-    run = runs.run_folder(args, "wall")
-    runs.seed_torch(args)
-    before = parts()
-    runs.load_checkpoint(args, before)  # a new run: nothing happens
+def begin(parse, tmp_path, *flags):
+    """A `Run` and its parts."""
+    changing = parts()
+    return runs.Run(parse("--runs-dir", tmp_path, *flags), "wall", changing), changing
+
+
+def test_run_continues_with_every_part_its_step_and_its_time(parse, tmp_path):
+    run, before = begin(parse, tmp_path)
+    run.start(10, "update")
+    assert run.step == 0 and not run.interrupted
+    runs.seed_torch(run.args)
     learn(before)
-    runs.save_checkpoint(run, before, "cpu")
-    assert {path.name for path in run.iterdir()} == {"args.json", "checkpoint.pt"}
+    run.advance(3)
+    run.advance()
+    run._began -= 100.0  # as if that had taken so long
+    run.save()
+    run.close()
     expected = [learn(before) for _ in range(3)]
 
-    args = parse("--resume", run)
-    after = parts()
-    runs.load_checkpoint(args, after)
-    assert after["counts"]["updates"] == 1 and after["alpha"].requires_grad
+    resumed, after = begin(parse, tmp_path, "--resume", run.folder)
+    assert resumed.folder == run.folder and resumed.step == 4 and 100 <= resumed.seconds < 110
+    assert after["counts_of_mine"]["updates"] == 1 and after["alpha"].requires_grad
     assert [learn(after) for _ in range(3)] == expected
+    resumed.start(10, "update")
+    resumed.advance()
+    resumed.save()
+    resumed.close()
+    assert 100 < resumed.seconds < 115 and resumed.step == 5
     for newer, name in (
         ({"critic": torch.nn.Linear(1, 1)}, "critic"),
-        ({"counts": {"updates": 0, "best_step": 0}}, "best_step"),
+        ({"counts_of_mine": {"updates": 0, "best_step": 0}}, "best_step"),
     ):
         with pytest.raises(SystemExit, match=f"of another version: it has no {name}"):
-            runs.load_checkpoint(args, after | newer)
+            runs.Run(resumed.args, "wall", after | newer)
     with pytest.raises(SystemExit, match="of another version: the layers of its model are others$"):
-        runs.load_checkpoint(args, after | {"model": torch.nn.Linear(4, 2)})
+        runs.Run(resumed.args, "wall", after | {"model": torch.nn.Linear(4, 2)})
+
+
+def test_parameters_that_are_not_finite_are_not_saved(parse, tmp_path):
+    run, changing = begin(parse, tmp_path)
+    changing["model"].weight.data[0, 0] = np.nan
+    with pytest.raises(FloatingPointError, match="the parameters of `model` are no longer finite"):
+        run.save()
+    assert not (run.folder / "checkpoint.pt").exists()
 
 
 @pytest.mark.parametrize("prefix", ["", "boxes@"])  # a file, and a task with a robot's file
@@ -180,7 +210,7 @@ def test_files_are_found_from_another_working_directory(parse, tmp_path, monkeyp
         Path(name).touch()
     flags = ["--data", "a.h5", "--files", "missing.h5", "--runs-dir", "runs"]
     flags += ["--name", f"{prefix}mine.yaml"]
-    run = runs.run_folder(parse(*flags), "mine").absolute()
+    run = folder_of(parse(*flags), "mine").absolute()
     assert parse("--resume", run).name == f"{prefix}mine.yaml"
     monkeypatch.chdir(tmp_path / "there")
     args = parse("--resume", run)
@@ -190,16 +220,16 @@ def test_files_are_found_from_another_working_directory(parse, tmp_path, monkeyp
 
 
 def test_leftovers_of_a_kill_are_removed(parse, tmp_path):
-    run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
+    run = folder_of(parse("--runs-dir", tmp_path))
     left = run / ".checkpoint.pt.0123abcd.tmp"
     left.write_text("half of one")
     with new_contents(run / "policy.onnx") as being_written:
-        runs.run_folder(parse("--resume", run), "wall")
+        folder_of(parse("--resume", run))
         assert not left.exists() and being_written.exists()
         being_written.write_text("whole")
     assert {path.name for path in run.iterdir()} == {"args.json", "policy.onnx"}
     left.touch()
-    runs.save_checkpoint(run, parts(), "cpu")
+    runs.Run(parse("--resume", run), "wall", parts()).save()
     assert not left.exists()
 
 
@@ -207,16 +237,19 @@ SCRIPT = """
 import os, resource, signal, sys
 from dataclasses import dataclass
 import torch
-from roboarm_nmp.training import runs
+from pathlib import Path
+from roboarm_nmp.training import arguments, runs
 
 @dataclass
-class Args(runs.RunFlags):
-    pass
+class Args:
+    seed: int = 1
+    runs_dir: Path = Path("runs")
+    resume: Path | None = None
+    device: str = "cpu"
+    track: bool = False
 
-args = runs.parse_args(Args)
-run = runs.run_folder(args, "wall")
 numbers = torch.zeros(1000)
-runs.save_checkpoint(run, {"numbers": numbers}, "cpu")
+run = runs.Run(arguments.parse_args(Args), "wall", {"numbers": numbers})
 """
 
 
@@ -231,15 +264,14 @@ def script(folder, code):
     ("code", "message"),
     [
         (
-            "resource.setrlimit(resource.RLIMIT_FSIZE, (900, 900))\nsave()",
+            "resource.setrlimit(resource.RLIMIT_FSIZE, (900, 900)); numbers += 1; run.save()",
             "error: .*: 'checkpoint.pt'",
         ),
         ("torch.zeros(10**15)", "error: out of memory .+"),
     ],
 )
 def test_errors_that_are_no_mistake_of_the_program_get_a_line(tmp_path, code, message):
-    save = "def save():\n    runs.save_checkpoint(run, {'numbers': numbers + 1}, 'cpu')\n"
-    ended, run = script(tmp_path, save + code)
+    ended, run = script(tmp_path, f"run.save()\n{code}")
     lines = ended.stderr.strip().splitlines()
     assert ended.returncode != 0 and "Traceback" not in ended.stderr
     assert re.fullmatch(message, lines[-2])
@@ -249,14 +281,13 @@ def test_errors_that_are_no_mistake_of_the_program_get_a_line(tmp_path, code, me
 
 
 def test_signal_outside_the_loop_ends_a_run_with_a_line(tmp_path):
-    ended, run = script(tmp_path, "os.kill(os.getpid(), signal.SIGINT)")
+    ended, run = script(tmp_path, "run.save(); os.kill(os.getpid(), signal.SIGINT)")
     assert ended.returncode == 130
     line = f"interrupted; --resume {run} continues from the last checkpoint"
     assert ended.stderr.splitlines()[-1] == line and "Traceback" not in ended.stderr
 
 
 LOOP = """
-run = runs.Run(args, "wall", {"numbers": numbers}, "cpu")
 run.start(10, "update")
 while run.step < 10:
     run.advance()
@@ -266,26 +297,24 @@ while run.step < 10:
         assert run.interrupted  # and this step is completed
         %s
     if run.interrupted:
-        run.checkpoint()
+        run.save()
     assert run.step <= 3
 """
 
 
 def test_signals_in_the_loop_end_a_run_in_a_checkpoint(tmp_path):
     # `timeout` sends it to all processes, and so does a search to its trainers.
-    ended, _ = script(tmp_path, LOOP % "os.kill(os.getpid(), signal.SIGTERM)")
-    run = sorted(tmp_path.iterdir())[-1]
+    ended, run = script(tmp_path, LOOP % "os.kill(os.getpid(), signal.SIGTERM)")
     assert ended.returncode == 143
     line = f"terminated; checkpoint at update 3; --resume {run} continues there"
     assert ended.stderr.splitlines()[-1] == line
     state = torch.load(run / "checkpoint.pt", weights_only=True)
-    assert state["progress"]["step"] == 3 and (state["numbers"] == 3).all()
+    assert state["counts"]["step"] == 3 and (state["numbers"] == 3).all()
 
 
 def test_second_signal_ends_a_run_at_once(tmp_path):
     later = "runs.SAME_INTERRUPT = 0.0; os.kill(os.getpid(), signal.SIGTERM)"
-    ended, _ = script(tmp_path, LOOP % later)
-    run = sorted(tmp_path.iterdir())[-1]
+    ended, run = script(tmp_path, LOOP % later)
     assert ended.returncode == 143
     line = f"terminated; no checkpoint yet; --resume {run} starts again"
     assert ended.stderr.splitlines()[-1] == line
@@ -293,14 +322,13 @@ def test_second_signal_ends_a_run_at_once(tmp_path):
 
 
 def test_damaged_checkpoint_is_rejected_by_name(parse, tmp_path):
-    run = runs.run_folder(parse("--runs-dir", tmp_path), "wall")
+    run = folder_of(parse("--runs-dir", tmp_path))
     args = parse("--resume", run)
-    runs.load_checkpoint(args, parts())  # stopped before the first checkpoint
-    runs.save_checkpoint(run, parts(), "cpu")
+    runs.Run(args, "wall", parts()).save()  # it was stopped before the first checkpoint
     content = (run / "checkpoint.pt").read_bytes()
     (run / "checkpoint.pt").write_bytes(content[: len(content) // 2])
     with pytest.raises(SystemExit, match="checkpoint.pt is damaged"):
-        runs.load_checkpoint(args, parts())
+        runs.Run(args, "wall", parts())
     saved = torch.load(io.BytesIO(content), weights_only=True)
     rng, unnoticed = np.random.default_rng(0), 0
     for _ in range(20):
@@ -308,21 +336,24 @@ def test_damaged_checkpoint_is_rejected_by_name(parse, tmp_path):
         flipped[rng.integers(len(content))] ^= 1 << rng.integers(8)
         (run / "checkpoint.pt").write_bytes(flipped)
         with contextlib.suppress(SystemExit):
-            runs.load_checkpoint(args, parts())
+            runs.Run(args, "wall", parts())
             unnoticed += 1  # nothing but padding or a date was hit:
             assert str(torch.load(run / "checkpoint.pt", weights_only=True)) == str(saved)
     assert unnoticed < 10
 
 
 def test_events_of_repeated_steps_are_hidden(parse, tmp_path):
-    args = parse("--runs-dir", tmp_path)
-    run = runs.run_folder(args, "wall")
-    for begin, end in ((0, 4), (2, 5)):  # stopped after step 4, its checkpoint was of step 2
-        with runs.summary_writer(run, args, begin) as writer:
-            for step in range(begin + 1, end + 1):
-                writer.add_scalar("loss", 10 * begin + step, step)
+    folder = folder_of(parse("--runs-dir", tmp_path))
+    for first, end in ((0, 4), (2, 5)):  # stopped after step 4, its checkpoint was of step 2
+        run = runs.Run(parse("--resume", folder), "wall", {})
+        run._counts["step"] = first
+        run.start(5, "step")
+        while run.step < end:
+            run.advance()
+            run.log({"loss": torch.full((2,), 10.0 * first + run.step), "nothing": None})
+        run.close()
         time.sleep(1.1)  # TensorBoard orders files by their names, which have the second
-    events = EventAccumulator(str(run))
+    events = EventAccumulator(str(folder))
     events.Reload()
     found = [(event.step, event.value) for event in events.Scalars("loss")]
     assert found == [(1, 1), (2, 2), (3, 23), (4, 24), (5, 25)]
@@ -336,56 +367,20 @@ def test_track_logs_to_weights_and_biases(parse, tmp_path, monkeypatch):
     (tmp_path / "wandb.py").write_text("calls = []\ndef init(**kw): calls.append(kw)\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "wandb", raising=False)
+
+    def start(args):
+        run = runs.Run(args, "wall", {})
+        run.start(1, "step")
+        run.close()
+        return run.folder
+
     args = parse("--runs-dir", tmp_path / "runs", "--data", "a.h5")
-    run = runs.run_folder(args, "wall")
-    runs.summary_writer(run, args, 0).close()
+    run = start(args)
     assert "wandb" not in sys.modules  # off by default
 
     args = parse("--resume", run, "--track")
-    runs.summary_writer(run, args, 0).close()
+    start(args)
     (call,) = sys.modules.pop("wandb").calls
     assert call["sync_tensorboard"] and call["id"] == run.name and call["resume"] == "allow"
     assert (call["config"]["data"], call["config"]["steps"]) == ("a.h5", 10)
     json.dumps(call)  # plain values only
-
-
-def begin(parse, tmp_path, *flags):
-    """A `Run` and its parts."""
-    args, changing = parse("--runs-dir", tmp_path, *flags), parts()
-    return runs.Run(args, "wall", changing, torch.device("cpu")), changing
-
-
-def test_run_continues_with_step_time_and_best_evaluation(parse, tmp_path, monkeypatch):
-    run, changing = begin(parse, tmp_path)
-    run.start(10, "update")
-    assert (run.step, run.best_step, run.best_score, run.best_result) == (0, 0, -math.inf, {})
-    assert run.advance() == 1 and run.is_best(0.5, {"error": 2.0})
-    assert run.advance(3) == 4 and not run.is_best(0.4)
-    expected = learn(changing)
-    run._bar.start_t -= 100.0  # as if that had taken so long
-    run.checkpoint()
-    run.close()
-    learn(changing)
-
-    resumed, again = begin(parse, tmp_path, "--resume", run.folder)
-    assert resumed.folder == run.folder and resumed.step == 4
-    assert (resumed.best_step, resumed.best_score) == (1, 0.5)
-    assert resumed.best_result == {"error": 2.0} and 100 <= resumed.seconds < 110
-    assert again["counts"]["best"]["loss"] == expected
-    resumed.start(10, "update")
-    resumed.advance()
-    resumed.checkpoint()
-    assert 100 < resumed.seconds < 115
-    resumed.close()
-
-
-def test_equal_score_is_the_best_and_nan_never(parse, tmp_path):
-    run, _ = begin(parse, tmp_path)
-    run.start(10, "update")
-    found = []
-    for score in (math.nan, 0.5, 0.7, 0.6, 0.7, math.nan):
-        run.advance()
-        found.append(run.is_best(score))
-    run.close()
-    assert found == [False, True, True, False, True, False]
-    assert (run.best_step, run.best_score) == (5, 0.7)

@@ -4,25 +4,23 @@
     trajectory = rollout(env, query, begin(0, query).act)
     trajectory.success, trajectory.collides, trajectory.configurations
 
-`rollout` runs one episode. `rollouts` runs several at once, for a network that predicts all of
-their actions in one call. `Episode` goes step by step, for a loop of your own. Metrics and images
-are derived from trajectories.
+`Episode` goes step by step, for a loop of your own. Metrics and images are derived from
+trajectories.
 """
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from typing import TypeVar
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from roboarm_nmp.datasets.queries import Query
-from roboarm_nmp.envs.arm_env import Observation, RoboArmEnv
+from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.motions.trajectories import Trajectory
 from roboarm_nmp.policies.policy import Policy
 
-AnyPolicy = TypeVar("AnyPolicy", bound=Policy)
 REAL_TIME = "real_time"
 """A delay: as many steps as an action takes to compute, of wall-clock time."""
 
@@ -126,62 +124,17 @@ def rollout(
     Raises:
         ValueError: the environment refuses the query or an action.
     """
-    if policy is None:
-        return Episode(env, query).trajectory()
-    [trajectory] = rollouts(
-        [env], [query], lambda env, number: policy, delay=delay, planning_seconds=planning_seconds
-    )
-    return trajectory
-
-
-def rollouts(
-    envs: Sequence[RoboArmEnv],
-    queries: Sequence[Query],
-    begin: Callable[[RoboArmEnv, int], AnyPolicy],
-    predict: Callable[[list[AnyPolicy], list[Observation]], None] | None = None,
-    delay: int | str = 0,
-    planning_seconds: float = 0.0,
-) -> Iterator[Trajectory]:
-    """Yield the `Trajectory` of every query, in the order in which the episodes end.
-
-    Args:
-        envs: environments that are alike. In each of them there is one episode at a time.
-        queries: `datasets.queries.Queries`, or a list of `Query`.
-        begin: begin(env, number) makes the policy for an episode, after its reset, on the query
-            of that number.
-        predict: predict(policies, observations), which is called before each step, for policies
-            whose actions are predicted by one call of a network.
-        delay, planning_seconds: see `rollout`. `REAL_TIME` needs a single environment.
-
-    Raises:
-        ValueError: an environment refuses a query or an action.
-    """
-    waiting = enumerate(queries)
-    idle = list(envs)
-    running = []
-    while True:
-        for env, (number, query) in zip(idle, waiting, strict=False):  # as long as there are both
-            running.append((Episode(env, query), begin(env, number)))
-        if not running:
-            return
+    episode = Episode(env, query)
+    while policy is not None and not episode.ended:
         began = time.perf_counter()
-        active = [(episode, policy) for episode, policy in running if not episode.ended]
-        if predict is not None and active:
-            observations = [episode.observation for episode, _ in active]
-            predict([policy for _, policy in active], observations)
-        for episode, policy in active:
-            action = policy(episode.observation)
-            steps = delay
-            if delay == REAL_TIME:
-                seconds = time.perf_counter() - began + planning_seconds
-                planning_seconds = 0.0
-                steps = max(1, math.ceil(seconds / STEP_SECONDS))
-            episode.step_delayed(action, steps)
-        ended = [episode for episode, _ in running if episode.ended]
-        running = [pair for pair in running if not pair[0].ended]
-        idle = [episode.env for episode in ended]
-        for episode in ended:
-            yield episode.trajectory()
+        action = policy(episode.observation)
+        steps: Any = delay
+        if delay == REAL_TIME:
+            seconds = time.perf_counter() - began + planning_seconds
+            planning_seconds = 0.0
+            steps = max(1, math.ceil(seconds / STEP_SECONDS))
+        episode.step_delayed(action, steps)
+    return episode.trajectory()
 
 
 def render_steps(
