@@ -5,9 +5,9 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import onnx
@@ -27,12 +27,13 @@ from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
 from roboarm_nmp.evaluation.evaluate import evaluate
 from roboarm_nmp.networks.export import read_weights
 from roboarm_nmp.networks.network_file import load_network
+from roboarm_nmp.policies.export import save_policy
 from roboarm_nmp.policies.registry import PolicyError, find_policy, make_policy
 from roboarm_nmp.policies.safety_filter import VERSION, SafetyFilter
-from roboarm_nmp.training import protocol
 
 dagger = load("dagger")
 HARD = "random_boxes_hard"
+CPU = torch.device("cpu")
 
 
 def write_paths(folder, scenes, paths):
@@ -63,7 +64,7 @@ def setting(request, folder, tmp_path_factory):
     args = dagger.Args(token_width=16, hidden_size=32, bf16=False)
     examples = RoadmapExamples(paths, ground_truth_checker, seed=1)
     draws = [examples.draw(number, count=256, noise=0.03) for number in range(6)]
-    batch = dagger.concat([dagger.on_device(draw, "cpu") for draw in draws])
+    batch = dagger.concat([dagger.on_device(draw, CPU) for draw in draws])
     assert set(batch["scene"].tolist()) == {0, 2}
     torch.manual_seed(1)
     actor = dagger.Actor(args, env)
@@ -87,7 +88,7 @@ def test_update(setting):
     actor, _, batch = setting
     old, actor = copy.deepcopy(actor), copy.deepcopy(actor)
     optimizer = torch.optim.Adam(actor.parameters(), lr=1e-3)
-    losses = list(dagger.update(actor, optimizer, batch, 0.1).values())
+    losses = list(dagger.update(actor, optimizer, 0.1, batch).values())
     with torch.no_grad():
         direction, length = (x.double().numpy() for x in old.outputs(**inputs_of(batch)))
     label = batch["direction"].double().numpy()
@@ -97,7 +98,7 @@ def test_update(setting):
     assert losses[0].item() == pytest.approx(1.0 - cosine.mean(), abs=1e-5)
     assert losses[1].item() == pytest.approx(smooth.mean(), rel=1e-4)
     for _ in range(30):
-        last = list(dagger.update(actor, optimizer, batch, 0.1).values())
+        last = list(dagger.update(actor, optimizer, 0.1, batch).values())
     assert last[0] < losses[0] - 0.02 and last[1] < losses[1]
 
 
@@ -127,22 +128,18 @@ def test_order_of_tokens_and_rows_of_zeros_do_not_matter(setting):
     assert (actor.outputs(**inputs)[0] - direction).abs().max() > 1e-3  # other tokens matter
 
 
-def test_saved_policy_has_its_safety_filter_and_acts_alone_as_in_a_batch(
-    setting, tmp_path, monkeypatch
-):
+def test_saved_policy_has_its_safety_filter_and_acts_alone_as_in_a_batch(setting, tmp_path):
     actor, env, _ = setting
     safety_filter = SafetyFilter(0.02, escape=False)
     arguments = {"goal_type": "combined", "encoder": env.encoder.name}
     arguments |= {"geometry_source": "ground_truth", "link_distances": True}
-    args = dagger.Args(runs_dir=tmp_path / "runs")
-    monkeypatch.setattr(sys, "excepthook", sys.excepthook)  # a run sets it
-    run = protocol.PolicyRun(args, {}, "cpu", arguments, [env], [], safety_filter)
-    run.save_policy(actor)
-    path, found = find_policy(run.folder)
+    save_policy(tmp_path / "policy.onnx", actor, HARD, safety_filter, **arguments)
+    path, found = find_policy(tmp_path / "policy.onnx")
     assert found == arguments
     observations = [env.reset(seed=seed)[0] for seed in range(8)]
     network = load_network(path)
-    together = network(**protocol.stack(observations, "cpu")).numpy()
+    stacked = {name: np.stack([one[name] for one in observations]) for name in observations[0]}
+    together = network(**{name: torch.tensor(rows) for name, rows in stacked.items()}).numpy()
     changed = 0
     for row, observation in enumerate(observations):
         act, _ = make_policy(path, env, safety_filter=False)(0, None)
@@ -172,14 +169,15 @@ def test_round_labels_states_that_the_policy_visits(folder):
         return 0.03 * torch.nn.functional.normalize(desired_goal[:, :7] - observation[:, :7])
 
     args = dagger.Args(round_queries=3, round_labels=5)
-    new, reached = dagger.dagger_round(act, env, None, examples, args, 40, "cpu")
+    no_filter = SimpleNamespace(filter_policy=lambda act, env, rng: act)
+    new, reached = dagger.dagger_round(act, env, no_filter, examples, args, 40, CPU)
     assert 0 < len(new["scene"]) <= 15 and 0 <= reached <= 1
     states = new["observation"][:, :7].numpy()
     distance = np.abs(states[:, None] - np.array(visited)).max(2).min(1)
     np.testing.assert_allclose(distance, 0.0, atol=1e-6)
     torch.testing.assert_close(new["direction"].norm(dim=1), torch.ones(len(states)))
-    again, _ = dagger.dagger_round(act, env, None, examples, args, 40, "cpu")
-    other, _ = dagger.dagger_round(act, env, None, examples, args, 80, "cpu")
+    again, _ = dagger.dagger_round(act, env, no_filter, examples, args, 40, CPU)
+    other, _ = dagger.dagger_round(act, env, no_filter, examples, args, 80, CPU)
     assert all(torch.equal(new[name], again[name]) for name in new)
     assert not torch.equal(new["observation"][:1], other["observation"][:1])
     env.close()
@@ -217,9 +215,9 @@ def test_killed_and_resumed_run_is_bit_identical_and_evaluated_as_validated(tmp_
         assert all(torch.equal(one[name][key], other[name][key]) for key in one[name])
 
     # The evaluation by name has the safety filter and the observations of the validation.
-    best = one["progress"]
+    best = json.loads((whole / "result.json").read_text())["validation_success_rate"]
     result = evaluate(whole, HARD, split="validation", num_queries=2)
-    assert result["success_rate"] == best["best_score"]
+    assert result["success_rate"] == best
     assert result["safety_filter"] == {"margin": 0.012, "escape": True, "version": VERSION}
     assert result["env"]["geometry_source"] == result["env"]["encoder"] == "point_cloud"
     assert result["env"]["num_points"] == 8
@@ -276,7 +274,7 @@ def test_run_on_another_device(tmp_path, folder, another_device, short_episodes)
     run_here(PATHS["dagger"], "--resume", run)
     assert json.loads((run / "result.json").read_text())["steps"] == 6
     state = torch.load(run / "checkpoint.pt", weights_only=True)
-    assert state["progress"]["step"] == 6
+    assert state["counts"]["step"] == 6
     for name in ("actor", "visited"):  # a round came after the resume, too
         assert {tensor.device.type for tensor in state[name].values()} == {another_device}
 

@@ -48,7 +48,7 @@ def test_update_evaluation_and_resume_on_another_device(
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)
-def test_no_kernel_receives_two_dtypes(trainer, tmp_path):
+def test_no_kernel_receives_two_dtypes(trainer, tmp_path, short_episodes):
     given = command(
         trainer, tmp_path, *flags(trainer), "--bf16", *(["True"] if trainer != "bc" else [])
     )[1:]

@@ -9,7 +9,7 @@ import pytest
 from paths import ROOT
 from trainers import PATHS, load
 
-from roboarm_nmp.training import runs
+from roboarm_nmp.training.arguments import parse_args
 from roboarm_nmp.utils import flags
 
 ENCODERS = ("vae", "vqvae", "pointnet2", "field")
@@ -38,7 +38,7 @@ def test_flag_out_of_range_is_rejected_by_name(script, flag, value, args_of, mon
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [script, flag, *value.split()])
     with pytest.raises(SystemExit) as ended:
-        runs.parse_args(args_of[script])
+        parse_args(args_of[script])
     assert str(ended.value.code).startswith(f"{script}: {flag}")
     assert str(ended.value.code).count("\n") == 0
     assert not list(tmp_path.iterdir())
@@ -49,10 +49,10 @@ def test_defaults_are_in_their_ranges_and_help_shows_these(
     script, args_of, monkeypatch, capsys, tmp_path
 ):
     monkeypatch.setattr(sys, "argv", [script, "--runs-dir", str(tmp_path)])
-    assert runs.parse_args(args_of[script]).seed == 1
+    assert parse_args(args_of[script]).seed == 1
     monkeypatch.setattr(sys, "argv", [script, "--help"])
     with pytest.raises(SystemExit):
-        runs.parse_args(args_of[script])
+        parse_args(args_of[script])
     shown = capsys.readouterr().out
     assert "--seed INT IN [0, 2^32)" in shown and "--batch-size INT >= 1" in shown
 

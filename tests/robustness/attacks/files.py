@@ -24,7 +24,8 @@ from roboarm_nmp.networks.export import save_network
 from roboarm_nmp.networks.network_file import load_network
 from roboarm_nmp.networks.untrusted import NetworkError
 from roboarm_nmp.scene_embedding_train import collect as observe
-from roboarm_nmp.training import runs
+from roboarm_nmp.scene_embedding_train.training_data import EncoderFlags
+from roboarm_nmp.training.runs import Run
 
 UNCHANGED, CHANGED = "read, as it was", "silent change"
 TEXTS = ("scene", "args")  # any change of these may be a user's
@@ -62,10 +63,9 @@ def make_files(folder):
     small = {"num": 2, "image_size": 32, "num_samples": 400, "workers": 1}
     observe.collect(observe.Args(output=folder / "observations", **small), progress=False)
     paths["observations"] = folder / "observations" / "shard_00000.h5"
-    paths["checkpoint"] = folder / "checkpoint.pt"
-    runs.save_checkpoint(folder, parts_of_a_run(), "cpu")
-    paths["args"] = folder / "args.json"
-    runs.write_json(paths["args"], {"seed": 3, "runs_dir": "runs", "rates": [1.0]})
+    run = Run(EncoderFlags(runs_dir=folder / "runs"), "mine", parts_of_a_run())
+    run.save()
+    paths |= {"checkpoint": run.folder / "checkpoint.pt", "args": run.folder / "args.json"}
     return paths
 
 
@@ -110,7 +110,8 @@ def content_of(kind, path):
         return digest(made.task, made.seed, repr(made.sensors), repr(made.scenes(0)), *arrays)
     if kind == "checkpoint":
         parts = parts_of_a_run()
-        runs.load_checkpoint(runs.RunFlags(resume=path.parent), parts)
+        with contextlib.redirect_stdout(io.StringIO()):
+            Run(EncoderFlags(resume=path.parent), "mine", parts)
         model, rng = parts["model"], parts["rng"].bit_generator.state
         arrays = [parameter.detach().numpy() for parameter in model.parameters()]
         return digest(*arrays, parts["optimizer"].state_dict(), parts["progress"], rng)
