@@ -413,3 +413,22 @@ def test_arm_moves_within_limits_that_replace_the_urdfs(urdf, limit):
     angles = [p.getJointState(body.id, index, physicsClientId=client)[0] for index in (0, 1)]
     p.disconnect(client)
     np.testing.assert_allclose(angles, [2.5, -2.5], atol=0.01)
+
+
+@pytest.mark.parametrize("order", itertools.permutations("abc"), ids="".join)
+def test_mimic_of_a_mimic_is_the_same_in_every_order_of_the_file(urdf, order):
+    """Of three fingers, `a` follows `b`, which follows `c`."""
+    limit = '<limit lower="0" upper="0.1" effort="50" velocity="2"/>'
+    more = {
+        "a": f'{limit}<mimic joint="b" multiplier="2" offset="0.01"/>',
+        "b": f'{limit}<mimic joint="c" multiplier="-0.5" offset="0.02"/>',
+        "c": limit,
+    }
+    fingers = [joint(name, "l2", f"f{name}", "prismatic", more=more[name]) for name in order]
+    links = [link(f"f{name}") for name in order]
+    path = urdf("".join([chain(3), *links, *fingers]))
+    fixed = robot_from_urdf(path, end_effector="l2", fixed={"c": 0.03})
+    expected = {"a": 0.02, "b": 0.005, "c": 0.03}
+    assert fixed.held == pytest.approx(expected)
+    opened = robot_from_urdf(path, end_effector="l2", fixed={"c": 0.0})
+    assert with_held(opened, {"c": 0.03}).held == pytest.approx(expected)
