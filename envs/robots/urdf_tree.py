@@ -274,8 +274,8 @@ class UrdfTree:
         soft = self.joints[joint].find("safety_controller")
         if soft is None:
             return
-        least = float(soft.get("soft_lower_limit", lower))
-        most = float(soft.get("soft_upper_limit", upper))
+        least = float(soft.get("soft_lower_limit", str(lower)))
+        most = float(soft.get("soft_upper_limit", str(upper)))
         if lower < least or most < upper:
             warnings.warn(
                 f"{self.path}: joint {joint!r}: the soft limits of its safety_controller are not "
