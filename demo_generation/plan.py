@@ -36,7 +36,7 @@ if TYPE_CHECKING:  # imported when they are needed, so that --help does not wait
 
 CLOUD_FLAGS = (
     *("robot", "units", "frame", "intrinsics", "recorded_at", "arm_distance", "table"),
-    *("workspace", "cell", "min_points", "point_radius"),
+    *("workspace", "cell", "min_points", "allow_empty", "point_radius"),
 )
 
 
@@ -81,6 +81,8 @@ class Args:
     """m: one point stays per cube of this size; by default 0.025, scaled with the arm's reach"""
     min_points: NonNegativeInt | None = None
     """a cube is an outlier if it and the 26 around it have fewer points; by default 3"""
+    allow_empty: bool = False
+    """plan even if nearly all points of the cloud are left out as not finite or out of reach"""
     point_radius: NonNegativeFloat = POINT_RADIUS
     """m, of the ball around each point"""
     seed: Seed = 0
@@ -92,6 +94,9 @@ class Args:
     path has none (extra `trajectories`); otherwise the motion has the speed of the environment"""
     output: Path | None = None
     """write the motion to this file, .csv, .npz, .json or .yaml (docs/guide/trajectories.md)"""
+
+
+ALMOST_ALL = 0.99  # of a cloud's points: its units or its frame are probably others
 
 
 def _numbers(flag: str, text: str, number: int) -> np.ndarray:
@@ -159,6 +164,13 @@ def _observed_scene(args: Args, path: Path, robot: Robot) -> ObservedScene:
     left_out = [f"{number:,} {step}" for step, number in removed.items() if number]
     print(f"{path}: {len(cloud):,} points; left out: {', '.join(left_out) or 'none'}")
     print(f"{len(points):,} points remain, prepared in {1000 * seconds:.0f} ms")
+    unusable = removed["not finite"] + removed["outside the workspace"]
+    if unusable >= ALMOST_ALL * len(cloud) and not args.allow_empty:
+        raise ValueError(
+            f"{path}: {unusable:,} of {len(cloud):,} points are not finite or out of reach, so "
+            f"obstacles may be missing: check --units, --frame and --workspace, or plan without "
+            f"them (--allow-empty)"
+        )
     return ObservedScene(
         points=points, point_radius=args.point_radius, robot=robot, table=table, floor=floor
     )

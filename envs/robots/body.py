@@ -4,6 +4,7 @@ import contextlib
 import copy
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import numpy as np
@@ -258,4 +259,6 @@ def resolve(
             above = [up for up in (folder, *folder.parents) if up.name == name]
             candidates = [*(up / rest for up in above), folder / name / rest, folder / rest]
             return str(next((path for path in candidates if path.exists()), candidates[0]))
-    return str(folder / filename.removeprefix("file://"))
+    if filename.startswith("file://"):
+        filename = unquote(filename.removeprefix("file://"))
+    return str(folder / filename)

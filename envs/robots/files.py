@@ -42,7 +42,7 @@ def load_robot(name_or_path: str | Path) -> Robot:
     if str(name_or_path) == PANDA.name:
         return PANDA
     path = Path(name_or_path)
-    if path.suffix not in ROBOT_FILES:
+    if path.suffix.lower() not in ROBOT_FILES:
         raise RobotError(f"a robot is {PANDA.name!r} or a file (.urdf, .yaml), got {path}")
     try:
         path = path.resolve(strict=True)
@@ -53,7 +53,7 @@ def load_robot(name_or_path: str | Path) -> Robot:
 
 @functools.lru_cache(16)
 def _load(path, _):
-    if path.suffix == ".urdf":
+    if path.suffix.lower() == ".urdf":
         return robot_from_urdf(path)
     options = _read(path)
     if "urdf" not in options:

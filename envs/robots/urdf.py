@@ -288,13 +288,22 @@ def _mimics(tree, joints, positions):
     Those that follow a held joint get their places in `positions`.
     """
     mimics = {}
-    for joint in tree.joints:  # parents first, so that a mimic's leader may be a mimic, too
-        if (mimic := tree.mimic(joint)) is None:
+    for joint in tree.joints:
+        mimic = tree.mimic(joint)
+        if mimic is None:
             continue
         leader, multiplier, offset = mimic
-        if leader in mimics:
-            leader, scale, shift = mimics[leader]
-            multiplier, offset = multiplier * scale, multiplier * shift + offset
+        passed = {joint}
+        while leader not in positions and leader not in joints:  # it may be a mimic, too
+            mimic = tree.mimic(leader)
+            if mimic is None:
+                break
+            if leader in passed:
+                raise tree.error(f"{joint!r} mimics itself")
+            passed.add(leader)
+            leader, scale, shift = mimic
+            offset = multiplier * shift + offset
+            multiplier = multiplier * scale
         if leader in positions:
             positions[joint] = multiplier * positions[leader] + offset
         elif leader in joints:

@@ -265,9 +265,23 @@ class UrdfTree:
                     f"limits={{{joint!r}: (-3.14, 3.14)}}"
                 )
             lower, upper = float(limit.get("lower", 0)), float(limit.get("upper", 0))
+            self._warn_of_soft_limits(joint, lower, upper)
         if not lower < upper:
             raise self.error(f"joint {joint!r}: limits from {lower} to {upper}")
         return lower, upper
+
+    def _warn_of_soft_limits(self, joint, lower, upper):
+        soft = self.joints[joint].find("safety_controller")
+        if soft is None:
+            return
+        least = float(soft.get("soft_lower_limit", str(lower)))
+        most = float(soft.get("soft_upper_limit", str(upper)))
+        if lower < least or most < upper:
+            warnings.warn(
+                f"{self.path}: joint {joint!r}: the soft limits of its safety_controller are not "
+                f"used; to use them: limits={{{joint!r}: ({least:g}, {most:g})}}",
+                stacklevel=2,
+            )
 
     def held_at(self, joint: str, fixed: Mapping[str, float]) -> float:
         """The position of another joint: from `fixed`, or 0 within its limits."""

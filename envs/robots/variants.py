@@ -82,13 +82,18 @@ def _followers(robot, positions):
     Joints that are in `positions` themselves are left out.
     """
     following = {}
-    for joint in parsed_urdf(robot).findall("joint"):
-        name, mimic = joint.get("name"), joint.find("mimic")
-        if mimic is None or name in positions or name not in robot.held:
-            continue
-        if (leader := mimic.get("joint")) in positions:
-            scale, offset = float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0))
-            following[name] = scale * positions[leader] + offset
+    joints = parsed_urdf(robot).findall("joint")
+    for _ in joints:  # a leader may follow another joint, and stand after it in the file
+        for joint in joints:
+            name = joint.get("name", "")
+            mimic = joint.find("mimic")
+            if mimic is None or name in positions or name not in robot.held:
+                continue
+            leader = mimic.get("joint", "")
+            position = positions.get(leader, following.get(leader))
+            if position is not None:
+                scale = float(mimic.get("multiplier", 1))
+                following[name] = scale * position + float(mimic.get("offset", 0))
     return following
 
 

@@ -98,7 +98,7 @@ def _from_json(value, kind, begun_in: Path):
     if Path in (kind, *typing.get_args(kind)):
         return Path(_from_here(value, begun_in))
     files = [
-        _from_here(part, begun_in) if part.endswith(ROBOT_FILES) else part
+        _from_here(part, begun_in) if part.lower().endswith(ROBOT_FILES) else part
         for part in value.split("@")  # TASK@ROBOT
     ]
     return "@".join(files)

@@ -170,7 +170,7 @@ def check_archive(path: Path) -> None:
 @contextlib.contextmanager
 def temporary_file(text, suffix):
     """A context: the path of a file with this text."""
-    with tempfile.NamedTemporaryFile("w", suffix=suffix) as file:
+    with tempfile.NamedTemporaryFile("w", suffix=suffix, encoding="utf-8") as file:
         file.write(text)
         file.flush()
         yield file.name

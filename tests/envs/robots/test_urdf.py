@@ -2,7 +2,10 @@
 
 import dataclasses
 import itertools
+import os
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -413,3 +416,48 @@ def test_arm_moves_within_limits_that_replace_the_urdfs(urdf, limit):
     angles = [p.getJointState(body.id, index, physicsClientId=client)[0] for index in (0, 1)]
     p.disconnect(client)
     np.testing.assert_allclose(angles, [2.5, -2.5], atol=0.01)
+
+
+@pytest.mark.parametrize("order", itertools.permutations("abc"), ids="".join)
+def test_mimic_of_a_mimic_is_the_same_in_every_order_of_the_file(urdf, order):
+    """Of three fingers, `a` follows `b`, which follows `c`."""
+    limit = '<limit lower="0" upper="0.1" effort="50" velocity="2"/>'
+    more = {
+        "a": f'{limit}<mimic joint="b" multiplier="2" offset="0.01"/>',
+        "b": f'{limit}<mimic joint="c" multiplier="-0.5" offset="0.02"/>',
+        "c": limit,
+    }
+    fingers = [joint(name, "l2", f"f{name}", "prismatic", more=more[name]) for name in order]
+    links = [link(f"f{name}") for name in order]
+    path = urdf("".join([chain(3), *links, *fingers]))
+    fixed = robot_from_urdf(path, end_effector="l2", fixed={"c": 0.03})
+    expected = {"a": 0.02, "b": 0.005, "c": 0.03}
+    assert fixed.held == pytest.approx(expected)
+    opened = robot_from_urdf(path, end_effector="l2", fixed={"c": 0.0})
+    assert with_held(opened, {"c": 0.03}).held == pytest.approx(expected)
+
+
+def test_soft_limits_that_are_not_used_are_named(urdf):
+    soft = '<safety_controller soft_lower_limit="-1" soft_upper_limit="1.2" k_velocity="1"/>'
+    limit = '<limit lower="-1.5" upper="1.5" effort="50" velocity="2"/>'
+    elements = "".join(
+        [link("l0", BAR), link("l1", BAR), joint("j1", "l0", "l1", more=limit + soft)]
+    )
+    with pytest.warns(UserWarning, match=r"soft limits .* to use them: limits={'j1': \(-1, 1.2\)}"):
+        assert robot_from_urdf(urdf(elements)).lower.tolist() == [-1.5]
+
+
+def test_file_urls_capital_endings_and_other_alphabets_are_read(tmp_path):
+    mesh = tmp_path / "my arm" / "meshes" / "a mesh.obj"
+    mesh.parent.mkdir(parents=True)
+    mesh.write_text(
+        "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    shape = "0 0 0", "0 0 0", f'<mesh filename="{mesh.as_uri()}"/>'
+    path = tmp_path / "my arm" / "ARM.URDF"
+    elements = link("l0", BAR) + link("l1", BAR, shape) + joint("j1", "l0", "l1")
+    path.write_text(f'<robot name="ärm">{elements}</robot>', encoding="utf-8")
+    script = f"from roboarm_nmp.envs.robots.files import load_robot; load_robot({str(path)!r})"
+    environment = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    subprocess.run([sys.executable, "-c", script.encode()], check=True, env=environment)
+    assert load_robot(path).name == "ärm"
