@@ -21,7 +21,7 @@ import numpy as np
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import roboarm_nmp
 from roboarm_nmp.datasets.episodes import DemoQueriesWrapper, demo_transitions, load_demos_for
@@ -34,9 +34,9 @@ from roboarm_nmp.training.cuda_graphs import adam, graphed, to_device
 from roboarm_nmp.training.final_test import RESULTS, finish, load_task
 from roboarm_nmp.training.network_parts import Bf16Linear, GoalFeatures
 from roboarm_nmp.training.runs import Run, check_finite, script_name, seed_torch
+from roboarm_nmp.training.vector_envs import async_envs
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.progress import progress_bar
-from roboarm_nmp.utils.workers import starting_processes
 
 
 # SHARED: flags of the run
@@ -523,8 +523,7 @@ if __name__ == "__main__":
     run = Run(args, task_name(args.task), state)
     makers = [functools.partial(make_env, args, demos)] * args.num_envs
     if device.type == "cuda":  # it would wait for the environments; a CPU computes longer than they
-        with starting_processes():
-            envs = AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.SAME_STEP)
+        envs = async_envs(makers)
     else:
         envs = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
     demo_buffer = None

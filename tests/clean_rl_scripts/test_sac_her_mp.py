@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from gymnasium.vector import SyncVectorEnv
 from scipy.spatial.transform import Rotation
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from trainers import ONE_EVALUATION, PATHS, load, panda_env, run_here, run_script
@@ -16,6 +16,7 @@ from roboarm_nmp.demo_generation import collect
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.training import cuda_graphs
 from roboarm_nmp.training.network_parts import GoalFeatures, JacobianTranspose
+from roboarm_nmp.training.vector_envs import async_envs
 
 sac = load("sac_her_mp")
 
@@ -240,7 +241,7 @@ def demo_file(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("vector_env", [SyncVectorEnv, AsyncVectorEnv])
+@pytest.mark.parametrize("vector_env", [SyncVectorEnv, lambda makers, **_: async_envs(makers)])
 def test_transitions_are_those_of_single_environments_and_failures_inject_demonstrations(
     tmp_path, demo_file, vector_env, monkeypatch, short_episodes
 ):
@@ -248,8 +249,6 @@ def test_transitions_are_those_of_single_environments_and_failures_inject_demons
     taken = []
 
     def make_envs(makers, **options):
-        if vector_env is AsyncVectorEnv:
-            options["context"] = "spawn"
         made = vector_env(makers, **options)
         step = made.step
         made.step = lambda actions: taken.append(actions) or step(actions)

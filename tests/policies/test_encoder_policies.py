@@ -51,7 +51,7 @@ def test_buffer_samples_have_the_latent_codes_of_moving_obstacles():
     env = envs.make(MOVING, encoder="oracle")
     env.reset(seed=0)
     sac = load("sac_her_mp")
-    buffer = sac.HerReplayBuffer(env, 60, 0.0, np.random.default_rng(0))
+    buffer = sac.HerReplayBuffer(env, 60, sac.Args(her_probability=0.0), np.random.default_rng(0))
     stored = {}
     for _ in range(8):
         episode = steps(env, 10)
@@ -59,7 +59,7 @@ def test_buffer_samples_have_the_latent_codes_of_moving_obstacles():
         buffer.add_episode(episode)
     env.close()
     assert len({t["observation"][10:].tobytes() for t in episode}) > 5
-    copy = sac.HerReplayBuffer(env, 60, 0.0, np.random.default_rng(0))
+    copy = sac.HerReplayBuffer(env, 60, sac.Args(her_probability=0.0), np.random.default_rng(0))
     copy.load_state_dict(buffer.state_dict())
     for one in (buffer, copy):
         batch = one.sample(200)
@@ -97,7 +97,8 @@ def test_appended_link_distances_in_observations_buffer_and_demonstrations():
     arguments = {"encoder": "oracle", "append_link_distances": True}
     env = envs.make(HARD, **arguments, link_distances=True, geometry_source="ground_truth")
     env.reset(seed=0)
-    buffer = load("sac_her_mp").HerReplayBuffer(env, 60, 0.0, np.random.default_rng(0))
+    sac = load("sac_her_mp")
+    buffer = sac.HerReplayBuffer(env, 60, sac.Args(her_probability=0.0), np.random.default_rng(0))
     episode = steps(env, 10)
     buffer.add_episode(episode)
     observations = np.stack([one["observation"] for one in episode])

@@ -308,10 +308,12 @@ def _say_plainly(run: Path, kind, error, trace) -> None:
         exit_interrupted(error, checkpoint or f"no checkpoint yet; --resume {run} starts again")
     if isinstance(error, MemoryError) or "allocate" in str(error):  # PyTorch's, a RuntimeError
         text = f"error: out of memory {str(error).partition(chr(10))[0]}".rstrip()
-    elif isinstance(error, (BrokenProcessPool, EOFError)) or (
-        isinstance(error, OSError) and error.errno in (*DISK_ERRORS, errno.EPIPE)
+    elif isinstance(error, (EOFError, ConnectionError)):
+        text = "error: a process with environments has died"
+    elif isinstance(error, BrokenProcessPool) or (
+        isinstance(error, OSError) and error.errno in DISK_ERRORS
     ):
-        text = f"error: {error or 'a process with environments has died'}"
+        text = f"error: {error}"
     elif isinstance(error, FloatingPointError):
         text = f"error: training has diverged: {error}; its files are in {run}"
         checkpoint = ""
