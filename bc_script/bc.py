@@ -305,4 +305,5 @@ if __name__ == "__main__":
             )
         if run.interrupted:
             run.save()
+    run.save()  # a longer run, which continues this one, knows its best policy
     finish(run, test, progress["best"], progress["best_step"])

@@ -622,5 +622,6 @@ if __name__ == "__main__":
             buffer.end_episodes()
             run.save()
     envs.close()
+    run.save()  # a longer run, which continues this one, knows its best policy
     finish(run, test, progress["best"], progress["best_step"])
     # END SHARED

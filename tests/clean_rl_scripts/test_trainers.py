@@ -82,6 +82,8 @@ def test_run_writes_result_policy_and_tensorboard_events(finished_run, trainer):
     assert 0 <= result["collision_free_success_rate"] <= result["success_rate"] <= 1
     assert result["goal_type"] == result["args"]["goal_type"] == goal_type
     assert isinstance(json.loads((finished_run / "args.json").read_text())["bf16"], bool)
+    progress = torch.load(finished_run / "checkpoint.pt", weights_only=True)["progress"]
+    assert (progress["evaluated"], progress["best_step"]) == (600, result["policy_step"])
 
     events = EventAccumulator(str(finished_run))
     events.Reload()

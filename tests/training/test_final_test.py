@@ -1,30 +1,19 @@
 """training/final_test.py: a trainer's queries, the test of its best policy, and its result."""
 
+import functools
 import json
 import sys
-from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 import torch
+from trainers import load
 
 from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.policies.export import save_policy
 from roboarm_nmp.training.final_test import finish, load_task
 from roboarm_nmp.training.runs import Run
 
-
-@dataclass
-class Args:
-    task: str = "no_obstacles"
-    goal_type: str = "config"
-    seed: int = 1
-    eval_queries: int = 5
-    test_queries: int = 3
-    runs_dir: Path = Path("runs")
-    resume: Path | None = None
-    device: str = "cpu"
-    track: bool = False
+Args = functools.partial(load("bc").Args, goal_type="config", eval_queries=5, test_queries=3)
 
 
 class Toward(torch.nn.Module):
