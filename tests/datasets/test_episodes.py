@@ -19,7 +19,7 @@ def test_resets_draw_queries_of_demonstrations_and_a_seed_repeats_them():
     drawn = []
     for seed in (3, None, None, 3, None, None):
         observation, info = env.reset(seed=seed)
-        demo = env.demo
+        demo = demos[info["demo"]]
         np.testing.assert_allclose(observation["observation"][:7], demo.states[0], atol=1e-3)
         assert env.unwrapped.scene == demo.scene and info["elapsed_steps"] == 0
         np.testing.assert_array_equal(env.unwrapped.goal_configuration, demo.goal)
