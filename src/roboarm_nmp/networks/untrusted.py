@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -156,7 +156,9 @@ def _check_computation(model):
     graph = model.graph
     versions = {one.domain: one.version for one in model.opset_import}
     integers = (onnx.TensorProto.INT32, onnx.TensorProto.INT64)
-    types, sizes, known = {}, {}, {}  # of tensors by name; `known` are those of sizes and indices
+    types: dict[str, Any] = {}  # of tensors by name
+    sizes = {}
+    known = {}  # tensors of sizes and indices
     for value in graph.input:
         kind = types[value.name] = onnx.TypeProto()
         kind.CopyFrom(value.type)
