@@ -2,10 +2,6 @@
 
 import copy
 import json
-import os
-import signal
-import subprocess
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +11,7 @@ import pytest
 import torch
 from one_type import OneType
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from trainers import PATHS, command, load, refusal, run_here, run_script
+from trainers import PATHS, killed_run, load, refusal, run_here, run_script
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths, shard_bytes
@@ -196,18 +192,7 @@ def test_killed_and_resumed_run_is_bit_identical_and_evaluated_as_validated(tmp_
         assert [event.step for event in events.Scalars(f"eval/{tag}")] == [20, 40]
     assert [event.step for event in events.Scalars("charts/round_success")] == [15, 30]
 
-    process = subprocess.Popen(
-        command("dagger", tmp_path / "killed", *flags),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    deadline = time.time() + 300
-    while not list((tmp_path / "killed").glob("*/checkpoint.pt")) and time.time() < deadline:
-        time.sleep(0.02)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    (killed,) = (tmp_path / "killed").iterdir()
-    assert not (killed / "result.json").exists()
+    killed = killed_run("dagger", tmp_path / "killed", *flags)
     run_here(PATHS["dagger"], "--resume", killed)
     one, other = (torch.load(run / "checkpoint.pt", weights_only=True) for run in (whole, killed))
     for name in ("actor", "actor_average", "visited"):

@@ -5,8 +5,6 @@ import json
 import math
 import os
 import signal
-import subprocess
-import time
 
 import pytest
 import torch
@@ -17,6 +15,7 @@ from trainers import (
     PATHS,
     TRAINERS,
     command,
+    killed_run,
     load,
     refusal,
     run_here,
@@ -159,19 +158,7 @@ def test_killed_and_resumed_run_is_bit_identical_to_an_uninterrupted_one(
     flags, whole = [*FINISHED[name], "--device", device], finished_runs[name]
     if device != "cpu":
         whole = run_script(name, tmp_path / "whole", *flags)
-    process = subprocess.Popen(
-        command(name, tmp_path / "killed", *flags),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    deadline = time.time() + 120
-    while not list((tmp_path / "killed").glob("*/checkpoint.pt")) and time.time() < deadline:
-        time.sleep(0.02)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    killed = next((tmp_path / "killed").iterdir())
-    assert not (killed / "result.json").exists()
-
+    killed = killed_run(name, tmp_path / "killed", *flags)
     run_here(PATHS[name], "--resume", killed)
     assert_same_checkpoints(whole, killed)
     results = [json.loads((run / "result.json").read_text()) for run in (whole, killed)]

@@ -4,7 +4,9 @@ import functools
 import importlib.util
 import runpy
 import signal
+import subprocess
 import sys
+import time
 from unittest.mock import patch
 
 import pytest
@@ -78,6 +80,20 @@ def run_script(trainer, folder, *flags):
     """The folder of such a run, made in this process, which saves seconds of imports."""
     run_here(*command(trainer, folder, *flags)[1:])
     return next(folder.iterdir())
+
+
+def killed_run(trainer, folder, *flags):
+    """The folder of such a run in another process, which is killed after its first checkpoint."""
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    process = subprocess.Popen(command(trainer, folder, *flags), **quiet)
+    deadline = time.time() + 300
+    while not list(folder.glob("*/checkpoint.pt")) and time.time() < deadline:
+        time.sleep(0.02)
+    process.kill()
+    process.wait()
+    (run,) = folder.iterdir()
+    assert not (run / "result.json").exists()
+    return run
 
 
 def run_here(script, *arguments):

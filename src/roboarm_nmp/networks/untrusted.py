@@ -181,7 +181,7 @@ def _check_computation(model):
             schema, node, {name: types[name] for name in inputs}, known, None, model.opset_import
         )
         for name in (*inputs, *filter(None, node.output)):
-            kind = types.get(name, onnx.TypeProto()).tensor_type
+            kind: Any = types.get(name, onnx.TypeProto()).tensor_type
             shape = kind.shape.dim
             if not kind.HasField("shape") or not all(size.HasField("dim_value") for size in shape):
                 raise NetworkError(f"the shape of a result of {node.op_type} depends on values")
