@@ -359,14 +359,15 @@ class _Page:
 
         simulation = self.simulation
         episodes = simulation.episodes
-        lines = [f"**{episodes.task}**, {episodes.label(simulation.split, simulation.number)}"]
+        # As code, because Markdown makes a mail link of TASK@FILE.
+        lines = [f"**`{episodes.task}`**, {episodes.label(simulation.split, simulation.number)}"]
         if episodes.note:
             lines.append(f"Random queries: {episodes.note}.")
         for arm in simulation.arms:
             mark = "▶"
-            if arm.success:
+            if arm.success and not arm.problem:
                 mark = "✓"
-            elif arm.ended and not arm.problem:
+            elif arm.ended or arm.problem:
                 mark = "✗"
             facts = [outcome(arm)]
             if arm.ms_per_action is not None:
