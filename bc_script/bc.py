@@ -4,9 +4,8 @@
     python bc_script/bc.py --task double_walls --goal-type config --demos a.h5 b.h5
 
 Maximum likelihood of the demonstrated actions under a Gaussian policy, or with `--num-modes` a
-mixture of Gaussians (paper, sections 2 and 5, appendix "Parameter sweeps"). For an algorithm of
-your own, copy this file and change the parts under `# ALGO LOGIC`. Parts between `# SHARED` and
-`# END SHARED` are the same in `sac_her_mp.py`.
+mixture of Gaussians (paper, sections 2 and 5, appendix "Parameter sweeps"). For your own algorithm,
+copy this file and change the parts under `# ALGO LOGIC`; `# SHARED` is as in `sac_her_mp.py`.
 """
 
 import functools
@@ -72,8 +71,7 @@ class Args(RunArgs):
     num_demos: flags.PositiveInt | None = None
     """number of demonstrations of each file, the first ones; by default all"""
     total_updates: flags.PositiveInt = 1_000_000
-    """batches of the whole run (paper: 1,000,000); a resumed run may have more, and then has the
-    learning rate of that longer run"""
+    """batches of the whole run, which the learning rate depends on (paper: 1,000,000)"""
     batch_size: flags.PositiveInt = 256
     """transitions per batch"""
     learning_rate: flags.PositiveFloat = 1e-3
@@ -83,8 +81,7 @@ class Args(RunArgs):
     num_modes: flags.Width = 1
     """Gaussians of the policy's mixture; the most likely one's mean is the action in evaluation"""
     policy_average: flags.PositiveShare = 0.001
-    """share of the policy that moves, in each of its updates, into the running average that is
-    evaluated and saved (1: no averaging)"""
+    """share of the policy that moves per update into the average that is saved (1: no averaging)"""
     hidden_size: flags.Width = 256
     """width of the hidden layers"""
     num_hidden_layers: flags.Layers = 2
@@ -201,13 +198,10 @@ class Actor(nn.Module):
 
 # ALGO LOGIC: demonstrations
 def transitions(demos, goal_type):
-    """All transitions of `Demos`, m of an arm with n joints.
+    """All transitions of `Demos`, m of an arm with n joints, also those after a goal is reached.
 
-    A demonstration is used to its end, also after its goal counts as reached.
-
-    Returns:
-        Observations (m, o), goals (m, g) and actions (m, n), in units of `MAX_STEP`, float32; and
-        the numbers of their demonstrations, int64 (m,).
+    Returns observations (m, o), goals (m, g), actions (m, n), in units of `MAX_STEP`, float32, and
+    the numbers of their demonstrations, int64 (m,).
     """
     demo_index = np.repeat(np.arange(len(demos)), np.diff(demos.offsets))
     has_action = np.ones(len(demo_index), bool)
@@ -236,11 +230,7 @@ if __name__ == "__main__":
     validation, test = load_task(args)
     with errors_of("--demos"):
         demos = load_demo_files(args.demos, args.task, args.num_demos)
-    env_arguments = {
-        "goal_type": args.goal_type,
-        "encoder": args.encoder,
-        "num_points": args.num_points,
-    }
+    env_arguments = {name: getattr(args, name) for name in ("goal_type", "encoder", "num_points")}
     with errors_of("--encoder"):
         env: Any = roboarm_nmp.make(args.task, **env_arguments)  # for its spaces
 
