@@ -600,7 +600,7 @@ if __name__ == "__main__":
             if time.monotonic() - logged > LOG_SECONDS or progress["updates"] == 1:
                 logged = time.monotonic()
                 run.log({f"losses/{name}": value for name, value in losses.items()})
-                run.log({"charts/SPS": run.rate})
+                run.log({"charts/SPS": run.rate, "charts/running_return": returns.mean()})
         if run.interrupted:
             buffer.end_episodes()
             run.save()
