@@ -121,7 +121,7 @@ def test_killed_and_resumed_is_bit_identical_to_uninterrupted(
 def test_update_evaluation_and_resume_run_on_another_device(
     name, observations, tmp_path, another_device
 ):
-    """One update, one evaluation and one resume on another device."""
+    """One update and one evaluation on another device; of one trainer a resume, too."""
     _, script, *flags = command(name, observations, tmp_path, "--device", another_device)
     flags += ["--total-updates", "1", "--eval-every", "1"]
     flags += ["--restart-every", "1"] if name == "vqvae" else []
@@ -130,6 +130,8 @@ def test_update_evaluation_and_resume_run_on_another_device(
     run_here(script, *flags)
     (folder,) = tmp_path.iterdir()
     assert load_network(folder / "encoder.onnx").metadata["step"] == 1
+    if name != "vae":  # all resume alike, and each evaluation exports a network
+        return
     args = json.loads((folder / "args.json").read_text())
     (folder / "args.json").write_text(json.dumps(args | {"total_updates": 2}))
     run_here(script, "--resume", str(folder))
@@ -142,7 +144,7 @@ def test_diverged_run_ends_with_an_error(observations, tmp_path):
     flags = ("--learning-rate", "1e30", "--total-updates", "3", "--eval-every", "3")
     with pytest.raises(FloatingPointError, match="are no longer finite"):
         run_here(*command("vae", observations, tmp_path, *flags)[1:])
-    assert not list(tmp_path.glob("*/encoder*.pt")) and not list(tmp_path.glob("*/checkpoint.pt"))
+    assert not list(tmp_path.glob("*/encoder*")) and not list(tmp_path.glob("*/checkpoint.pt"))
 
 
 def test_folder_without_observations_is_rejected(tmp_path, capsys):
