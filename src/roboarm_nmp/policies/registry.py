@@ -359,10 +359,10 @@ def _trained(path, env):
         unknown -= {"recurrent_state"}
     if unknown:
         raise PolicyError(f"{path}: needs {', '.join(sorted(unknown))}, which is not observed")
-    for name, (_, *shape) in network.inputs.items():
-        if name in example and list(example[name].shape) != shape:
+    for name, shape in network.inputs.items():
+        if name in example and example[name].shape != shape[1:]:
             raise PolicyError(
-                f"{path}: its input {name} has the shape {tuple(shape)}, the environment's "
+                f"{path}: its input {name} has the shape {shape[1:]}, the environment's "
                 f"observation {example[name].shape}"
             )
     try:
