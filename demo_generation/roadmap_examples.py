@@ -1,31 +1,32 @@
 """Examples of motions to a goal, from roadmap paths: what a policy observes, and its labels.
 
+    examples = RoadmapExamples("random_boxes_hard", None, encoder, find_checker, seed=1)
+    examples(0)                     # of a new scene, whose roadmap is made first
     paths = load_roadmap_paths("roadmaps")
-    examples = RoadmapExamples(paths, find_geometry_source("ground_truth"), seed=1)
-    batch = examples.draw(0, count=256, noise=0.03)        # from one scene, anywhere on its paths
-    batch = examples.label(scene, states, goals, rng)      # from given configurations (DAgger)
+    examples = RoadmapExamples("random_boxes_hard", paths, encoder, find_checker, seed=1)
+    examples(0)                     # of one of the scenes of `paths`
 
-Examples are dicts of NumPy arrays, a row each:
-
-Of an arm with j joints and l links that may collide:
+Examples are dicts of NumPy arrays, a row each. Of an arm with j joints and l links that may
+collide:
 
 - `observation` float32 (n, j + 3), for goal poses (n, j + 7), without the encoded scene, and
   `desired_goal` float32 (n, g);
 - `link_distances` and `goal_link_distances` float32 (n, l, 1 + j), as of
   `envs.wrappers.LinkDistancesWrapper`;
 - `direction` float32 (n, j): the unit vector to continue in, in normalised configurations;
-- `length` float32 (n,): of the remaining path, normalised;
-- `scene` int64 (n,): its index in `paths.scenes`.
+- `length` float32 (n,): of the remaining path, normalised.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from roboarm_nmp.datasets.episodes import observed
 from roboarm_nmp.datasets.roadmap_paths import RoadmapPaths
-from roboarm_nmp.demo_generation.roadmaps import Roadmap
-from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
+from roboarm_nmp.demo_generation.roadmaps import random_paths_of_scene
+from roboarm_nmp.envs.perception.encoders import SceneEncoder
+from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.utils.random_streams import Stream
 
 AHEAD = 0.1  # normalised: an example's direction is to the point of its path so far ahead
@@ -34,125 +35,82 @@ PER_PATH = 4  # examples of each chosen path, which share the link distances at 
 Examples = dict[str, np.ndarray]
 
 
+@dataclass
 class RoadmapExamples:
-    """Makes examples. Equal arguments give equal examples.
+    """Makes the examples of one scene after the other. Equal arguments give equal examples.
 
-    Args:
-        paths: `datasets.roadmap_paths.RoadmapPaths`.
-        geometry_source: from a scene to what computes `link_distances`, of
+    Attributes:
+        task: a task, in whose scenes roadmaps are made.
+        paths: `datasets.roadmap_paths.RoadmapPaths`, or None: new scenes of the task, a new roadmap
+            in each.
+        encoder: from a scene to its code.
+        find_checker: from a scene to what computes `link_distances`, of
             `envs.perception.geometry_source.find_geometry_source`.
-        seed: of `draw`, >= 0.
+        seed: >= 0.
         goal_type: "config", "combined" or "pose".
+        count: number of examples of each scene.
+        noise: standard deviation (normalised, each joint) of configurations around the paths.
     """
 
-    def __init__(
-        self,
-        paths: RoadmapPaths,
-        geometry_source: Callable,
-        seed: int,
-        goal_type: str = "combined",
-    ):
-        self.paths = paths
-        self.geometry_source = geometry_source
-        self.seed = seed
-        self.goal_type = goal_type
-        self._scenes = np.flatnonzero(np.diff(paths.path_offsets))  # those that have paths
-        steps = np.linalg.norm(np.diff(paths.points, axis=0), axis=1)
-        steps[paths.offsets[1:-1] - 1] = 1.0  # from a path's end to the next one: any length
-        # Length of all paths up to each point.
-        self._travelled = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
+    task: str
+    paths: RoadmapPaths | None
+    encoder: SceneEncoder
+    find_checker: Callable
+    seed: int
+    goal_type: str = "combined"
+    count: int = 4096
+    noise: float = 0.03
 
-    def choose_paths(
-        self, rng: np.random.Generator, number: int
-    ) -> tuple[int, np.ndarray, np.ndarray]:
-        """A random scene, and the first and last points of `number` of its paths: indices."""
-        scene = int(rng.choice(self._scenes))
-        begin, end = self.paths.path_offsets[scene : scene + 2]
-        path = rng.integers(begin, end, number)
-        return scene, self.paths.offsets[path], self.paths.offsets[path + 1] - 1
+    def __call__(self, number: int) -> tuple[np.ndarray, Examples]:
+        """A scene's code, float32 (z,), and its examples. Each `number` >= 0 has its own."""
+        rng = np.random.default_rng([self.seed, Stream.ROADMAP_EXAMPLES, number])
+        if self.paths is None:
+            scene, paths = random_paths_of_scene(number, self.task, self.seed)
+        else:
+            scene, paths = self.paths.random_scene(rng)
+        return self.encoder(scene), self._draw(scene, paths, rng)
 
-    def random_query(self, rng: np.random.Generator) -> tuple[int, np.ndarray]:
-        """The two ends of a random path that the environment accepts as start and goal.
+    def _draw(self, scene: Scene, paths: list[np.ndarray], rng: np.random.Generator) -> Examples:
+        """Examples at random configurations near a scene's paths, in both directions."""
+        points = np.concatenate(paths).astype(np.float64)
+        ends = np.cumsum([len(path) for path in paths])
+        travelled = np.concatenate([[0.0], np.linalg.norm(np.diff(points, axis=0), axis=1)])
+        travelled[ends[:-1]] = 1.0  # from a path's end to the next one: any length
+        travelled = np.cumsum(travelled)  # of all paths up to each point
 
-        Returns:
-            The index of the scene, and the ends, normalised (2, j).
-        """
-        while True:
-            scene, first, last = self.choose_paths(rng, 1)
-            ends = self.paths.points[np.r_[first, last]]
-            # Rounding might make the environment reject a path that is only just free.
-            if ground_truth_checker(self.paths.scenes[scene]).is_free(ends, margin=0.001).all():
-                return scene, ends
+        chosen = rng.integers(len(paths), size=-(-self.count // PER_PATH))
+        chosen = np.repeat(chosen, PER_PATH)[: self.count]
+        last = ends[chosen] - 1
+        first = np.concatenate([[0], ends])[chosen]
+        backwards = np.repeat(rng.random(-(-self.count // PER_PATH)) < 0.5, PER_PATH)[: self.count]
+        rest = rng.random(self.count) * (travelled[last] - travelled[first])
 
-    def draw(self, number: int, count: int, noise: float) -> Examples:
-        """Examples at random configurations near the paths of one scene.
-
-        Args:
-            number: >= 0; each number has its own examples.
-            count: of examples.
-            noise: standard deviation (normalised, each joint) around the paths.
-        """
-        rng = np.random.default_rng([self.seed, Stream.DAGGER_EXAMPLES, number])
-        scene, first, last = self.choose_paths(rng, -(-count // PER_PATH))
-        path = np.arange(count) // PER_PATH
-        first, last = first[path], last[path]
-        backwards = (rng.random(count) < 0.5)[path]
-        rest = rng.random(count) * (self._travelled[last] - self._travelled[first])
-
-        def at(rest):
+        def at(rest: np.ndarray) -> np.ndarray:
             """The points on the paths from which `rest` remains."""
-            travelled = np.where(
-                backwards, self._travelled[first] + rest, self._travelled[last] - rest
-            )
-            i = np.searchsorted(self._travelled, travelled, side="right") - 1
+            where = np.where(backwards, travelled[first] + rest, travelled[last] - rest)
+            i = np.searchsorted(travelled, where, side="right") - 1
             i = np.clip(i, first, last - 1)
-            share = (travelled - self._travelled[i]) / (self._travelled[i + 1] - self._travelled[i])
-            tail, head = self.paths.points[i], self.paths.points[i + 1]
-            return tail + share[:, None] * (head - tail)
+            share = (where - travelled[i]) / (travelled[i + 1] - travelled[i])
+            return points[i] + share[:, None] * (points[i + 1] - points[i])
 
         states = at(rest)
-        states = states + noise * rng.standard_normal((count, states.shape[1]))
+        states = states + self.noise * rng.standard_normal(states.shape)
         states = np.clip(states, -1.0, 1.0)
         rest = np.maximum(rest - AHEAD, 0.0)
         moves = at(rest) - states
         lengths = np.linalg.norm(moves, axis=1)
-        goals = self.paths.points[np.where(backwards, first, last)]
-        return self._examples(scene, states, goals, moves / lengths[:, None], lengths + rest)
 
-    def label(
-        self,
-        scene: int,
-        states: np.ndarray,
-        goals: np.ndarray,
-        rng: np.random.Generator,
-        roadmap: Roadmap | None = None,
-    ) -> Examples:
-        """Examples at given configurations, those from which a roadmap has a path to the goal.
-
-        Args:
-            scene: index of the scene.
-            states, goals: normalised (n, j).
-            rng: a NumPy Generator.
-            roadmap: the scene's `Roadmap`; by default a new one.
-        """
-        roadmap = roadmap or Roadmap(self.paths.scenes[scene], rng)
-        directions, lengths = roadmap.labels(states, goals, rng)
-        has_path = lengths > 0.0  # and is not at the goal
-        return self._examples(
-            scene, states[has_path], goals[has_path], directions[has_path], lengths[has_path]
-        )
-
-    def _examples(self, scene, states, goals, directions, lengths) -> Examples:
-        robot = self.paths.scenes[scene].robot
-        checker = self.geometry_source(self.paths.scenes[scene])
-        ends, end_of = np.unique(goals, axis=0, return_inverse=True)
-        observation, _, goal = observed(states, robot.denormalise(goals), self.goal_type, robot)
+        goals, goal_of = np.unique(np.where(backwards, first, last), return_inverse=True)
+        goals = points[goals]
+        checker = self.find_checker(scene)
+        robot = scene.robot
+        goal_angles = robot.denormalise(goals)[goal_of]
+        observation, _, desired_goal = observed(states, goal_angles, self.goal_type, robot)
         return {
             "observation": observation,
-            "desired_goal": goal,
+            "desired_goal": desired_goal,
             "link_distances": checker.link_distances(states),
-            "goal_link_distances": checker.link_distances(ends)[end_of],
-            "direction": directions.astype(np.float32),
-            "length": lengths.astype(np.float32),
-            "scene": np.full(len(states), scene),
+            "goal_link_distances": checker.link_distances(goals)[goal_of],
+            "direction": (moves / lengths[:, None]).astype(np.float32),
+            "length": (lengths + rest).astype(np.float32),
         }

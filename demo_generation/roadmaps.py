@@ -548,39 +548,30 @@ class Args:
     """Address of a Ray cluster (`auto`, `HOST:PORT`) to use instead of local processes."""
 
 
-# What a shard depends on, besides its number.
-OPTIONS = (
-    "task",
-    "paths_per_scene",
-    "num_nodes",
-    "num_neighbours",
-    "margin",
-    "shard_size",
-    "seed",
-)
+# What paths depend on, besides the number of their scene.
+OPTIONS = ("task", "paths_per_scene", "num_nodes", "num_neighbours", "margin", "seed")
 
 
-def random_paths_of_scene(index: int, options: dict) -> tuple[Scene, list[np.ndarray]]:
-    """`(Scene, paths)` of scene `index` of a collection. `options`: a dict with keys `OPTIONS`."""
-    rng = np.random.default_rng([options["seed"], Stream.ROADMAPS, index])
-    scene = envs.get_task(options["task"]).scene
-    number = options["paths_per_scene"]
+def random_paths_of_scene(
+    index: int, task: str, seed: int, paths_per_scene: int = 300, **options
+) -> tuple[Scene, list[np.ndarray]]:
+    """Scene `index` of a collection, and its paths: float32 (k, j), normalised.
+
+    `options`: `num_nodes`, `num_neighbours` and `margin` of `Roadmap`.
+
+    Raises RuntimeError: the scene leaves no room for the arm.
+    """
+    rng = np.random.default_rng([seed, Stream.ROADMAPS, index])
+    scene = envs.get_task(task).scene
     ends = more_nodes = None
     if isinstance(scene, Containers):
         scene, places = scene.sample_with_places(rng)
-        ends, on_ways = place_configurations(scene, places, rng, _goal_count(number))
+        ends, on_ways = place_configurations(scene, places, rng, _goal_count(paths_per_scene))
         more_nodes = _around(on_ways, rng)
     elif not isinstance(scene, Scene):
         scene = scene.sample(rng)
-    roadmap = Roadmap(
-        scene,
-        rng,
-        num_nodes=options["num_nodes"],
-        num_neighbours=options["num_neighbours"],
-        margin=options["margin"],
-        more_nodes=more_nodes,
-    )
-    return scene, roadmap.random_paths(number, rng, ends)
+    roadmap = Roadmap(scene, rng, more_nodes=more_nodes, **options)
+    return scene, roadmap.random_paths(paths_per_scene, rng, ends)
 
 
 def _around(states: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -608,7 +599,7 @@ class Collector:
         number, first, end = job
         scenes, paths = [], []
         for index in range(first, end):
-            scene, paths_of_scene = random_paths_of_scene(index, self.options)
+            scene, paths_of_scene = random_paths_of_scene(index, **self.options)
             scenes.append(scene)
             paths.append(paths_of_scene)
         task, seed = self.options["task"], self.options["seed"]
@@ -636,7 +627,10 @@ def collect(args: Args, progress: bool = True) -> RoadmapPaths:
         )
     shards.check_collection(args)
     options = {name: getattr(args, name) for name in OPTIONS}
-    words = [f"--{name.replace('_', '-')} {value}" for name, value in options.items()]
+    words = [
+        f"--{name.replace('_', '-')} {getattr(args, name)}"
+        for name in (*OPTIONS[:-1], "shard_size", "seed")
+    ]
     made_by = " ".join(["roboarm roadmaps", *words])
     shards.collect(
         args,

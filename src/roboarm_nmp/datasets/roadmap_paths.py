@@ -61,6 +61,11 @@ class RoadmapPaths:
         ends = self.offsets[first : last + 1]
         return [self.points[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True)]
 
+    def random_scene(self, rng: np.random.Generator) -> tuple[Scene, list[np.ndarray]]:
+        """One of the scenes that have paths, and its paths as of `of_scene`."""
+        i = int(rng.choice(np.flatnonzero(np.diff(self.path_offsets))))
+        return self.scenes[i], self.of_scene(i)
+
 
 def shard_bytes(
     task: str | Path,

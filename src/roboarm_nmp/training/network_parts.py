@@ -20,7 +20,10 @@ ACROSS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 
 
 class Bf16Linear(nn.Linear):
-    """A linear layer whose product is computed in bfloat16 in training, if `bf16`."""
+    """A linear layer whose product is computed in bfloat16 in training, if `bf16`.
+
+    The result is of the input's type.
+    """
 
     def __init__(self, num_inputs: int, num_outputs: int, bf16: bool):
         super().__init__(num_inputs, num_outputs)
@@ -29,7 +32,7 @@ class Bf16Linear(nn.Linear):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         if not (self.bf16 and self.training):
             return super().forward(x)
-        return F.linear(x.bfloat16(), self.weight.bfloat16(), self.bias.bfloat16()).float()
+        return F.linear(x.bfloat16(), self.weight.bfloat16(), self.bias.bfloat16()).to(x.dtype)
 
 
 class JacobianTranspose(nn.Module):

@@ -19,6 +19,5 @@ class Stream(enum.IntEnum):
     DEMONSTRATIONS = 3
     OBSERVATIONS = 4
     ROADMAPS = 5
-    DAGGER_EXAMPLES = 6
-    DAGGER_ROUNDS = 7
+    ROADMAP_EXAMPLES = 6
     SENSOR_NOISE = 8

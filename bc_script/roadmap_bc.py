@@ -1,14 +1,14 @@
-"""Imitation of a roadmap planner, with rounds of DAgger. One file: read it top to bottom.
+"""Imitation of roadmap paths: a policy for scenes never seen. One file: read it top to bottom.
 
-    roboarm roadmaps --task random_boxes_hard --scenes 800 --output roadmaps
-    roboarm train dagger --paths roadmaps --encoder oracle
-    python bc_script/dagger.py --paths roadmaps --encoder oracle    # the same
+    roboarm train roadmap-bc --task random_boxes_hard --stop-at-success 0.9
+    python bc_script/roadmap_bc.py --task random_boxes_hard --stop-at-success 0.9    # the same
 
-A policy for new scenes. It imitates the directions of a roadmap's smoothed paths, from random
-configurations near such paths and from those that the policy itself visits (DAgger: Ross et al.,
-2011). It observes the encoded scene (`--encoder`) and the signed distance of each link, here and at
-the goal (`envs.wrappers.LinkDistancesWrapper`). Part of it is a safety filter. For an algorithm of
-your own, copy this file and change the parts under `# ALGO LOGIC`; `# SHARED` is as in `bc.py`.
+In one random scene of the task after the other, a probabilistic roadmap plans a few hundred
+smoothed paths. The policy imitates the directions of these paths from configurations near them. It
+observes the encoded scene (`--encoder`) and the signed distance of each link, here and at the goal
+(`envs.wrappers.LinkDistancesWrapper`). Other processes make the roadmaps while this one learns.
+A safety filter is part of the saved policy. For an algorithm of your own, copy this file and change
+the parts under `# ALGO LOGIC`; `# SHARED` is as in `bc.py`.
 """
 
 import functools
@@ -25,7 +25,6 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 import roboarm_nmp
-from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.goals import GOAL_TYPES
 from roboarm_nmp.envs.perception.encoders import make_encoder
@@ -33,11 +32,10 @@ from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.evaluation.evaluate import evaluate, first_episode_images
-from roboarm_nmp.evaluation.rollout import rollout
 from roboarm_nmp.networks.export import read_weights
 from roboarm_nmp.policies.export import save_policy
 from roboarm_nmp.policies.registry import policy_file
-from roboarm_nmp.policies.safety_filter import PATIENCE, PROGRESS, SafetyFilter
+from roboarm_nmp.policies.safety_filter import SafetyFilter
 from roboarm_nmp.training.arguments import errors_of, fail, parse_args
 from roboarm_nmp.training.cuda_graphs import adam, graphed, set_learning_rate, to_device
 from roboarm_nmp.training.final_test import RESULTS, finish, load_task
@@ -45,7 +43,6 @@ from roboarm_nmp.training.network_parts import Bf16Linear, pose_difference
 from roboarm_nmp.training.runs import Run, script_name, seed_torch
 from roboarm_nmp.utils import flags, workers
 from roboarm_nmp.utils.progress import progress_bar
-from roboarm_nmp.utils.random_streams import Stream
 
 
 # SHARED: flags of the run
@@ -77,17 +74,20 @@ class RunArgs:
 @dataclass
 class Args(RunArgs):
     task: str = "random_boxes_hard"
-    """task to evaluate on, a task of `roboarm_nmp.TASKS` or a scene file; or TASK@FILE"""
+    """a task of `roboarm_nmp.TASKS` or a scene file, whose random scenes the policy learns in and
+    whose validation scenes it is evaluated in; with another arm TASK@FILE, a robot's file"""
     goal_type: Literal["config", "combined", "pose"] = "combined"
     """what the goal is: configuration, that and end-effector position, or end-effector pose"""
-    paths: tuple[Path, ...] = (Path("roadmaps"),)
-    """folders of roadmap paths to learn from (`roboarm roadmaps`), in scenes of any tasks of the
-    same robot"""
+    paths: tuple[Path, ...] = ()
+    """learn from these folders of roadmap paths (`roboarm roadmaps`), in scenes of any tasks of the
+    same robot, instead of making roadmaps in new scenes of the task"""
     initial_policy: str | None = None
     """begin with the weights of this policy of the same sizes: a name, a run's folder or a file"""
+    stop_at_success: flags.Share | None = None
+    """end at the first evaluation with this success rate on the validation queries"""
 
     # The algorithm
-    total_updates: flags.PositiveInt = 24_000
+    total_updates: flags.PositiveInt = 6_000
     """batches of the whole run"""
     batch_size: flags.PositiveInt = 768
     """examples per batch"""
@@ -98,23 +98,28 @@ class Args(RunArgs):
     policy_average: flags.PositiveShare = 0.003
     """share of the policy that moves, in each of its updates, into the running average that is
     evaluated and saved (1: no averaging)"""
-    pool_size: flags.PositiveInt = 200_000
-    """examples in memory, from which batches are sampled"""
+    first_scenes: flags.PositiveInt = 16
+    """scenes whose examples are made before the first update"""
+    pool_scenes: flags.PositiveInt = 64
+    """scenes whose examples are in memory, from which batches are sampled; after that, each new
+    scene replaces the oldest one"""
+    examples_per_scene: flags.PositiveInt = 4096
+    """examples of each scene"""
+    updates_per_scene: flags.PositiveInt = 16
+    """updates from one new scene to the next; with the default numbers each example is used three
+    times, and using them more often causes overfitting (docs/lab_notebook.md)"""
     workers: flags.Helpers = flags.CORES
-    """processes that draw examples, by default as many as there are cores (0: none beside this
-    one); results do not depend on their number"""
-    examples_per_update: flags.PositiveInt = 256
-    """new examples per update, all of one scene, which replace the oldest ones; with an eighth of a
-    batch, reusing them too often causes overfitting (docs/lab_notebook.md)"""
+    """processes that make roadmaps and examples, by default as many as there are cores (0: none
+    beside this one); results do not depend on their number"""
     noise: flags.NonNegativeFloat = 0.03
     """standard deviation of the configurations around paths (normalised, each joint)"""
     length_weight: flags.NonNegativeFloat = 0.1
     """weight of the second loss, that of the remaining length"""
-    encoder: str = "oracle"
+    encoder: str = "point_cloud"
     """the encoded scene as tokens: `point_cloud` for observed points, `oracle` for the ground-truth
     obstacles, or an encoder's latent code, a single token (`vae`, `vqvae`, `pointnet2`, `field`, or
     the path of your own `encoder.onnx`)"""
-    num_points: flags.PositiveInt = 64
+    num_points: flags.PositiveInt = 32
     """points of the encoder `point_cloud`"""
     geometry_source: str | None = None
     """where link distances take the obstacles from: `ground_truth`, `point_cloud`, or an encoder
@@ -134,16 +139,7 @@ class Args(RunArgs):
     escape: bool = True
     """escape from local minima"""
 
-    # DAgger
-    round_every: flags.NonNegativeInt = 2_000
-    """updates between rounds (0: none)"""
-    round_queries: flags.PositiveInt = 40
-    """queries of a round, each in a scene of the paths"""
-    round_labels: flags.NonNegativeInt = 16
-    """number of states that are labelled, of those that the policy visits on a query"""
-    round_weight: flags.NonNegativeFloat = 5.0
-    """probability of a visited state in a batch, relative to an example of the pool"""
-    eval_every: flags.PositiveInt = 4_000
+    eval_every: flags.PositiveInt = 1_500
     """updates between evaluations on validation queries"""
 
 
@@ -189,6 +185,7 @@ class Actor(nn.Module):
         robot = env.unwrapped.robot
         joints = robot.num_joints
         self.num_joints = joints
+        self.bf16 = args.bf16
         self.token_size = env.encoder.token_size  # numbers per token
         self.goal_is_pose = args.goal_type == "pose"
         self.arm_size = joints + GOAL_TYPES[args.goal_type].end_effector_size  # in the observation
@@ -235,10 +232,11 @@ class Actor(nn.Module):
         features = self.features(observation, desired_goal, **distances)
         joints = self.num_joints
         tokens = observation[:, self.arm_size :].unflatten(1, (-1, self.token_size))
-        fused = F.relu(self.token_in(tokens) + self.arm_in(features).unsqueeze(1))
-        fused = F.relu(self.fuse(fused))
-        is_token = (tokens != 0.0).any(dim=2, keepdim=True)
-        pooled = (fused * is_token).amax(1)  # (no number is below zero)
+        dtype = torch.bfloat16 if self.bf16 and self.training else features.dtype
+        arm = self.arm_in(features).to(dtype).unsqueeze(1)
+        fused = self.fuse(F.relu(self.token_in(tokens).to(dtype) + arm))
+        no_token = (tokens == 0.0).all(dim=2, keepdim=True)
+        pooled = F.relu(fused.masked_fill(no_token, 0.0).max(1).values).to(features.dtype)
         x = self.blocks(F.relu(self.first(torch.cat([features, pooled], dim=1))))
         outputs = self.head(x)
         if self.goal_is_pose:
@@ -270,60 +268,44 @@ def update(actor, optimizer, length_weight, batch):
     return {"losses/direction": direction_loss, "losses/length": length_loss}
 
 
-# ALGO LOGIC: a round of DAgger
-STUCK = 5.0  # states in which the policy makes no progress are so much likelier to be labelled
+# ALGO LOGIC: examples in memory
+class ExamplePool:
+    """The examples of the last `num_scenes` scenes, and the scenes' codes."""
 
+    def __init__(self, num_scenes, token_size, device):
+        self.num_scenes = num_scenes
+        self.token_size = token_size
+        self.device = device
+        self.num_added = 0
+        self.arrays = {}  # (num_scenes, examples, ...), allocated with the first scene
 
-def dagger_round(actor, env, safety_filter, examples, args, step, device):
-    """Let the policy act on random queries, and label states that it visits.
+    def add(self, scene, examples):
+        """Add a scene's code (z,) and its examples, in place of the oldest when all are there."""
+        arrays = {name: to_device(array, self.device) for name, array in examples.items()}
+        arrays["scene"] = to_device(scene, self.device)
+        if not self.arrays:
+            self.arrays = {
+                name: array.new_zeros(self.num_scenes, *array.shape)
+                for name, array in arrays.items()
+            }
+        for name, array in arrays.items():
+            self.arrays[name][self.num_added % self.num_scenes] = array
+        self.num_added += 1
 
-    Returns the new examples, and the share of queries on which the policy reached the goal.
-    """
-    rng = np.random.default_rng([args.seed, Stream.DAGGER_ROUNDS, step])
-    robot = env.unwrapped.robot
-    parts = []
-    reached = []
-    visited = []
-
-    @torch.no_grad()
-    def act(observation):
-        visited.append(observation["observation"][: robot.num_joints])
-        tensors = {name: to_device(array[None], device) for name, array in observation.items()}
-        return actor(**tensors)[0].cpu().numpy()
-
-    for _ in progress_bar(range(args.round_queries), "round", unit="query", transient=True):
-        number, ends = examples.random_query(rng)
-        start, goal = robot.denormalise(ends).astype(np.float32)
-        query = Query(start, goal, examples.paths.scenes[number])
-        visited.clear()
-        trajectory = rollout(env, query, safety_filter.filter_policy(act, env, rng))
-        reached.append(trajectory.success)
-        if not visited:  # the start was at the goal
-            continue
-        states = np.array(visited)
-        weights = np.ones(len(states))
-        moved = np.linalg.norm(states[PATIENCE:] - states[:-PATIENCE], axis=1)
-        weights[PATIENCE:][moved < PROGRESS] = STUCK
-        count = min(args.round_labels, len(states))
-        states = states[rng.choice(len(states), count, False, weights / weights.sum())]
-        parts.append(examples.label(number, states, np.repeat(ends[1:], count, axis=0), rng))
-    new = concat([on_device(part, device) for part in parts]) if parts else {}
-    return new, np.mean(reached)
-
-
-# ALGO LOGIC: batches, dicts of tensors
-def on_device(examples, device):
-    return {name: to_device(array, device) for name, array in examples.items()}
-
-
-def concat(parts):
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-
-
-def sample(examples, number):
-    """`number` random examples, with replacement."""
-    rows = torch.randint(len(examples["scene"]), (number,), device=examples["scene"].device)
-    return {name: tensor[rows] for name, tensor in examples.items()}
+    def sample(self, number):
+        """A batch of random examples, with replacement: a dict of tensors (number, ...)."""
+        num_rows = self.arrays["length"].shape[1]
+        scenes = min(self.num_added, self.num_scenes)
+        scene = torch.randint(scenes, (number,), device=self.device)
+        row = torch.randint(num_rows, (number,), device=self.device)
+        batch = {name: array[scene, row] for name, array in self.arrays.items() if name != "scene"}
+        codes = self.arrays["scene"][scene]
+        if self.device.type == "cpu":  # without padding (a CUDA graph needs the same shape always)
+            tokens = codes.unflatten(1, (-1, self.token_size))
+            most = int((tokens != 0.0).any(2).sum(1).max())
+            codes = tokens[:, : max(most, 1)].flatten(1)
+        batch["observation"] = torch.cat([batch["observation"], codes], dim=1)
+        return batch
 
 
 def copy_weights(policy, module):
@@ -336,21 +318,14 @@ def copy_weights(policy, module):
             parameter.data.copy_(torch.from_numpy(weights[name]))
 
 
-def without_padding(latents, token_size):
-    """Encoded scenes (scenes, z), without the tokens at the end that no scene has."""
-    tokens = latents.unflatten(1, (-1, token_size))
-    return tokens[:, : max(int((tokens != 0.0).any(2).sum(1).max()), 1)].flatten(1)
-
-
 LOG_SECONDS = 10  # between two logs of the losses
 
 if __name__ == "__main__":
     args = parse_args(Args, may_change={"test_queries", "workers"})
     device = seed_torch(args)
     validation, test = load_task(args)
-    num_draws = args.pool_size // args.examples_per_update
-    if num_draws < 1:
-        fail("--pool-size must be at least --examples-per-update")
+    if args.first_scenes > args.pool_scenes:
+        fail("--first-scenes must be at most --pool-scenes")
     robot = validation.scenes.base.robot
     with errors_of("--encoder"):
         encoder = make_encoder(args.encoder, args.num_points)
@@ -359,7 +334,7 @@ if __name__ == "__main__":
         geometry_source = args.geometry_source or encoder.geometry_source
         find_checker = find_geometry_source(geometry_source, robot)
     with errors_of("--paths"):
-        paths = load_roadmap_paths(args.paths, robot)
+        paths = load_roadmap_paths(args.paths, robot) if args.paths else None
     env_arguments = {
         "goal_type": args.goal_type,
         "encoder": args.encoder,
@@ -379,25 +354,30 @@ if __name__ == "__main__":
     actor_average.load_state_dict(actor.state_dict())
     optimizer = adam(actor.parameters(), args.learning_rate, device)
     learn = graphed(functools.partial(update, actor, optimizer, args.length_weight), device)
-    visited = {}  # examples of all rounds
     progress = {"evaluated": 0, "best": -1.0, "best_step": 0}
     state = {"actor": actor, "actor_average": actor_average, "optimizer": optimizer}
-    state |= {"visited": visited, "progress": progress}
-    run = Run(args, task_name(args.task), state)
-    visited |= {name: tensor.to(device) for name, tensor in visited.items()}
+    run = Run(args, task_name(args.task), {**state, "progress": progress})
 
     # Here, because SciPy and Numba take a while to import, which --help would wait for.
     from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
 
-    # ALGO LOGIC: data. The pool is not in checkpoints: a resumed run draws the same examples again.
-    latents = torch.as_tensor(env.encoder.encode_demos(paths), device=device)
-    latents = without_padding(latents, actor.token_size)
-    examples = RoadmapExamples(paths, find_checker, args.seed, args.goal_type)
-    draw = functools.partial(examples.draw, count=args.examples_per_update, noise=args.noise)
-    draws = workers.in_order(draw, itertools.count(run.step), args.workers)
-    pool = [next(draws) for _ in progress_bar(range(num_draws), "drawing examples", unit="batch")]
-    first = run.step % num_draws
-    pool = concat([on_device(part, device) for part in pool[-first:] + pool[:-first]])
+    # ALGO LOGIC: data. The pool is not in checkpoints: a resumed run makes the same examples again.
+    make_examples = RoadmapExamples(
+        task=args.task,
+        paths=paths,
+        encoder=encoder,
+        find_checker=find_checker,
+        seed=args.seed,
+        goal_type=args.goal_type,
+        count=args.examples_per_scene,
+        noise=args.noise,
+    )
+    pool = ExamplePool(args.pool_scenes, actor.token_size, device)
+    num_scenes = args.first_scenes + run.step // args.updates_per_scene
+    pool.num_added = max(num_scenes - args.pool_scenes, 0)
+    scenes = workers.in_order(make_examples, itertools.count(pool.num_added), args.workers)
+    for _ in progress_bar(range(pool.num_added, num_scenes), "roadmaps", unit="scene"):
+        pool.add(*next(scenes))
     logged = 0.0
     run.start(args.total_updates, "update")
 
@@ -410,10 +390,12 @@ if __name__ == "__main__":
             latest = run.folder / "latest.onnx"
             origin = {"script": script_name(), "seed": args.seed, "step": run.step}
             save_policy(latest, actor_average, args.task, safety_filter, origin, **env_arguments)
-            result = evaluate(latest, args.task, queries=validation)
+            evaluation = {"queries": validation, "workers": max(args.workers, 1)}
+            result = evaluate(latest, args.task, **evaluation)
             run.log({f"eval/{name}": result[name] for name in RESULTS})
-            bare = evaluate(latest, args.task, queries=validation, safety_filter=False)
+            bare = evaluate(latest, args.task, safety_filter=False, **evaluation)
             run.log({f"eval/{name}_without_filter": bare[name] for name in RESULTS})
+            run.show(success=f"{result['success_rate']:.3f}")
             if args.capture_video:
                 images = first_episode_images(latest, args.task, 40, queries=validation)
                 run.log_video("eval/episode", images)
@@ -424,39 +406,23 @@ if __name__ == "__main__":
                 os.replace(latest, run.folder / "policy.onnx")
         if run.step >= args.total_updates:
             break
+        if args.stop_at_success is not None and progress["best"] >= args.stop_at_success:
+            break
 
-        # ALGO LOGIC: learn, while the next examples are drawn
+        # ALGO LOGIC: learn, while other processes make the next scene's examples
         remaining = 1.0 - run.step / args.total_updates if args.anneal else 1.0
         set_learning_rate(optimizer, args.learning_rate * remaining)
-        batch = sample(pool, args.batch_size)
-        if visited and len(visited["scene"]):
-            weight = args.round_weight * len(visited["scene"])
-            count = int(args.batch_size * weight / (weight + len(pool["scene"])))
-            batch = concat([sample(visited, count), batch])
-            batch = {name: tensor[: args.batch_size] for name, tensor in batch.items()}
-        scenes = latents[batch.pop("scene")]
-        batch["observation"] = torch.cat([batch["observation"], scenes], dim=1)
-        losses = learn(batch)
+        losses = learn(pool.sample(args.batch_size))
         polyak_update(actor_average, actor, args.policy_average)
-        oldest = run.step % num_draws * args.examples_per_update
-        for name, tensor in on_device(next(draws), device).items():
-            pool[name][oldest : oldest + len(tensor)] = tensor
         run.advance()
+        if run.step % args.updates_per_scene == 0:
+            pool.add(*next(scenes))
         if time.monotonic() - logged > LOG_SECONDS or run.step == 1:
             logged = time.monotonic()
             run.log(losses | {"charts/learning_rate": args.learning_rate * remaining})
-            run.log({"charts/SPS": run.rate})
-
-        # ALGO LOGIC: a round of DAgger
-        if args.round_every and run.step % args.round_every == 0 and run.step < args.total_updates:
-            new, reached = dagger_round(
-                actor_average, env, safety_filter, examples, args, run.step, device
-            )
-            if new:
-                visited |= concat([visited, new]) if visited else new
-            run.log({"charts/round_success": reached})
+            run.log({"charts/SPS": run.rate, "charts/scenes": pool.num_added})
         if run.interrupted:
             run.save()
-    draws.close()
+    scenes.close()
     run.save()  # a longer run, which continues this one, knows its best policy
     finish(run, test, progress["best"], progress["best_step"])
