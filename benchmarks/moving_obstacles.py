@@ -37,7 +37,7 @@ SOURCES = ("nowhere", "point cloud", "ground truth")
 TRUTH = {"geometry_source": "ground_truth"}
 FILTER = {"safety_filter": SafetyFilter(0.01)}
 GOAL = {"env": {"goal_type": "combined"}}
-PRETRAINED = "dagger-combined-point_cloud-random_boxes_hard-s1"
+PRETRAINED = "roadmap-bc-combined-point_cloud-random_boxes_hard-s1"
 TASKS_HERE = [name for name, task in TASKS.items() if hasattr(task.scene, "animate")]
 
 
@@ -57,9 +57,9 @@ METHODS = {
     "go-filter-truth": Method("go-to-goal", "go-to-goal", "no", GOAL | TRUTH | FILTER),
     "plan": Method("one plan at the start", "planner", "once", GOAL | POINTS),
     "plan-truth": Method("one plan at the start", "planner", "once", GOAL | TRUTH),
-    "policy": Method("DAgger", PRETRAINED, "no", {}),
+    "policy": Method("roadmap BC", PRETRAINED, "no", {}),
     "policy-replan": Method(
-        "DAgger, replans when stuck", PRETRAINED, "when stuck", {"replan": True}
+        "roadmap BC, replans when stuck", PRETRAINED, "when stuck", {"replan": True}
     ),
     "replanning": Method("replanning", "replanning", "when blocked", GOAL | POINTS | FILTER),
     "replanning-truth": Method("replanning", "replanning", "when blocked", GOAL | TRUTH | FILTER),

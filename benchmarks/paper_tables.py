@@ -483,7 +483,7 @@ def draw_story(cells, results, baselines, unseen, path):
         of_task = [cell for cell in cells if cell.task == task]
         papers = [cell.mean for cell in of_task if cell.mean is not None]
         rates = (papers, [success_of(c, results) for c in of_task if c.name in results])
-        observed = unseen.get(task, {}).get("dagger, point_cloud")
+        observed = unseen.get(task, {}).get("roadmap BC, point_cloud")
         rates += ([observed["success_rate"]] if observed else [],)
         for name, found in zip(marks, rates, strict=True):
             if found:

@@ -17,7 +17,7 @@ HARD = "random_boxes_hard"
 FIXED = ("wall", "double_walls")
 REMARK = (
     "Success is reaching the goal, contacts allowed. Go-to-goal moves straight to the goal. "
-    "DAgger has a safety filter and receives link distances from the same source as its "
+    "Roadmap BC has a safety filter and receives link distances from the same source as its "
     "observation. The paper's policies have neither. Only the last two methods of "
     "`random_boxes_hard` search for a path before they move. Most rows are from one training seed; "
     "BC, and SAC on `wall`, are from three."
@@ -48,8 +48,8 @@ def results_table():
     add(HARD, "paper's best learned policy", f"{code} (VQ-VAE)", "no", [], best)
     add(HARD, "BC", f"{code} (VAE)", "no", paper_tables.of_recipe(cells[bc], results),
         cells[bc].mean)  # fmt: skip
-    add(HARD, "DAgger", f"{code} (field)", "yes", [hard["dagger, decoded by field"]], None)
-    add(HARD, "DAgger", "point cloud", "yes", [hard["dagger, point_cloud"]], None)
+    add(HARD, "roadmap BC", f"{code} (field)", "yes", [hard["roadmap BC, decoded by field"]], None)
+    add(HARD, "roadmap BC", "point cloud", "yes", [hard["roadmap BC, point_cloud"]], None)
     add(HARD, "plan from the point cloud", "point cloud", "no",
         [hard["plan from the point cloud"]], None)  # fmt: skip
     add(HARD, "RRT-Connect", privileged, "no", [hard["RRT-Connect, 5 s"]], None)

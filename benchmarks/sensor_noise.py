@@ -28,7 +28,7 @@ from roboarm_nmp.utils.files import write_atomically
 
 TASKS = ("random_boxes_hard", "moving_boxes_medium")
 LABELS = {
-    "policy": "DAgger",
+    "policy": "roadmap BC",
     "go-filter": "go-to-goal with filter",
     "plan": "one plan",
     "replanning": "replanning",

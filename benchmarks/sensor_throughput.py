@@ -32,7 +32,7 @@ from roboarm_nmp.policies.registry import find_policy, make_policy
 from roboarm_nmp.utils.bullet import pybullet as p
 
 TASK = "random_boxes_hard"
-POLICY = "dagger-combined-point_cloud-random_boxes_hard-s1"
+POLICY = "roadmap-bc-combined-point_cloud-random_boxes_hard-s1"
 
 
 def scenes(number):

@@ -1,6 +1,6 @@
 """Policies in unseen scenes, without and with a safety filter: docs/benchmark/unseen_obstacles.md.
 
-    python benchmarks/unseen_obstacles.py --keep runs/RUN         # a run of dagger.py: its policy
+    python benchmarks/unseen_obstacles.py --keep runs/RUN         # a run's policy
     python benchmarks/unseen_obstacles.py --workers 2             # hours; what is done is skipped
     python benchmarks/unseen_obstacles.py --only random_boxes_hard --num 10000 --workers 2
     python benchmarks/unseen_obstacles.py --table                 # only writes the tables
@@ -63,24 +63,25 @@ for _encoder, _filter in BC_FILTERS.items():
         f"bc, {_encoder}, no escape": [*_flags, *_filter, "--no-escape"],
         f"bc, {_encoder}": [*_flags, *_filter],
     }
-DECODED = "dagger, decoded by field"  # trained with observed points
-OBSERVED = "dagger, point_cloud"
+DECODED = "roadmap BC, decoded by field"  # trained with observed points
+OBSERVED = "roadmap BC, point_cloud"
 # The same training with other seeds (the first learned from older roadmaps): in `HARD` only.
 SEEDS = {
-    f"{OBSERVED}, seed {_seed}": f"dagger-combined-point_cloud-{HARD}-s{_seed}" for _seed in (2, 3)
+    f"{OBSERVED}, seed {_seed}": f"roadmap-bc-combined-point_cloud-{HARD}-s{_seed}"
+    for _seed in (2, 3)
 }
 CELLS |= {_name: ["--policy", _policy] for _name, _policy in SEEDS.items()}
 for _name, _policy, _filter, _source in (
-    ("dagger, vae", f"vae-{HARD}", POINT_CLOUD[:2], []),
-    ("dagger, vqvae", f"vqvae-{HARD}", POINT_CLOUD[:2], []),
-    ("dagger, pointnet2", f"pointnet2-{HARD}", POINT_CLOUD[:2], []),
-    ("dagger, field", f"field-{HARD}", POINT_CLOUD[:2], []),
+    ("roadmap BC, vae", f"vae-{HARD}", POINT_CLOUD[:2], []),
+    ("roadmap BC, vqvae", f"vqvae-{HARD}", POINT_CLOUD[:2], []),
+    ("roadmap BC, pointnet2", f"pointnet2-{HARD}", POINT_CLOUD[:2], []),
+    ("roadmap BC, field", f"field-{HARD}", POINT_CLOUD[:2], []),
     (DECODED, f"point_cloud-{HARD}", POINT_CLOUD[:2], ["--geometry-source", "field"]),
     (OBSERVED, f"point_cloud-{HARD}", POINT_CLOUD[:2], []),
     (f"{OBSERVED}, mixed scenes", "point_cloud-mixed_scenes", POINT_CLOUD[:2], []),
-    ("dagger, oracle", f"oracle-{HARD}", GROUND_TRUTH, []),
+    ("roadmap BC, oracle", f"oracle-{HARD}", GROUND_TRUTH, []),
 ):
-    _flags = ["--policy", f"dagger-combined-{_policy}-s1", *_source]
+    _flags = ["--policy", f"roadmap-bc-combined-{_policy}-s1", *_source]
     CELLS |= {
         f"{_name}, no filter": [*_flags, "--safety-margin", "0"],
         f"{_name}, no escape": [*_flags, *_filter, "--no-escape"],
@@ -97,14 +98,14 @@ ROWS = (
     ("BC", "latent code (VQ-VAE)", "point cloud", "bc, vqvae"),
     ("BC", "latent code (PointNet++)", "point cloud", "bc, pointnet2"),
     ("BC", PRIVILEGED, PRIVILEGED, "bc, oracle"),
-    ("DAgger", "latent code (VAE)", "point cloud", "dagger, vae"),
-    ("DAgger", "latent code (VQ-VAE)", "point cloud", "dagger, vqvae"),
-    ("DAgger", "latent code (PointNet++)", "point cloud", "dagger, pointnet2"),
-    ("DAgger", "latent code (field)", "latent code (field)", "dagger, field"),
-    ("DAgger, trained with points", "decoded points (field)", "latent code (field)", DECODED),
-    ("DAgger", "point cloud", "point cloud", OBSERVED),
-    ("DAgger, mixed scenes", "point cloud", "point cloud", f"{OBSERVED}, mixed scenes"),
-    ("DAgger", PRIVILEGED, PRIVILEGED, "dagger, oracle"),
+    ("roadmap BC", "latent code (VAE)", "point cloud", "roadmap BC, vae"),
+    ("roadmap BC", "latent code (VQ-VAE)", "point cloud", "roadmap BC, vqvae"),
+    ("roadmap BC", "latent code (PointNet++)", "point cloud", "roadmap BC, pointnet2"),
+    ("roadmap BC", "latent code (field)", "latent code (field)", "roadmap BC, field"),
+    ("roadmap BC, trained with points", "decoded points (field)", "latent code (field)", DECODED),
+    ("roadmap BC", "point cloud", "point cloud", OBSERVED),
+    ("roadmap BC, mixed scenes", "point cloud", "point cloud", f"{OBSERVED}, mixed scenes"),
+    ("roadmap BC", PRIVILEGED, PRIVILEGED, "roadmap BC, oracle"),
 )
 SEARCHING = (
     ("plan from the decoded cloud", "latent code (field)", "plan from the decoded cloud, field"),
@@ -113,25 +114,30 @@ SEARCHING = (
 )
 # Columns of the tables of every task.
 EVERYWHERE = (
-    *("go-to-goal, filter, point_cloud", OBSERVED, f"{OBSERVED}, mixed scenes", "dagger, oracle"),
+    *(
+        "go-to-goal, filter, point_cloud",
+        OBSERVED,
+        f"{OBSERVED}, mixed scenes",
+        "roadmap BC, oracle",
+    ),
     "plan from the point cloud",
 )
 # Columns of the tables of tasks with scenes of other kinds, and the random boxes.
 WITH_ENCODERS = (
-    *("dagger, vae", "dagger, vqvae", "dagger, pointnet2", "dagger, field"),
-    *(DECODED, OBSERVED, "dagger, oracle"),
+    *("roadmap BC, vae", "roadmap BC, vqvae", "roadmap BC, pointnet2", "roadmap BC, field"),
+    *(DECODED, OBSERVED, "roadmap BC, oracle"),
 )
 # How the columns are called in the tables.
 SHOWN = {
     "go-to-goal, filter, point_cloud": "go-to-goal with safety filter",
-    "dagger, vae": "VAE",
-    "dagger, vqvae": "VQ-VAE",
-    "dagger, pointnet2": "PointNet++",
-    "dagger, field": "field",
+    "roadmap BC, vae": "VAE",
+    "roadmap BC, vqvae": "VQ-VAE",
+    "roadmap BC, pointnet2": "PointNet++",
+    "roadmap BC, field": "field",
     DECODED: "decoded points (field)",
-    OBSERVED: "DAgger, point cloud",
-    f"{OBSERVED}, mixed scenes": "DAgger, mixed scenes",
-    "dagger, oracle": "DAgger, privileged",
+    OBSERVED: "roadmap BC, point cloud",
+    f"{OBSERVED}, mixed scenes": "roadmap BC, mixed scenes",
+    "roadmap BC, oracle": "roadmap BC, privileged",
 }
 UNSEEN = [
     name for name, task in STATIC_TASKS.items() if name.startswith("random") or not task.trainable
@@ -163,7 +169,7 @@ def keep(run):
     # Those that it learned from: a folder, or the first of several.
     paths = args["paths"][0] if isinstance(args["paths"], list) else args["paths"]
     scenes = load_roadmap_paths(Path(paths)).task
-    name = f"dagger-{args['goal_type']}-{args['encoder']}-{scenes}-s{args['seed']}"
+    name = f"roadmap-bc-{args['goal_type']}-{args['encoder']}-{scenes}-s{args['seed']}"
     to_float16(run / "policy.onnx", POLICIES / f"{name}.onnx")
     made = {"cell": name.rpartition("-")[0], "seed": args["seed"], "steps": training["steps"]}
     made |= {key: training[key] for key in ("policy_step", "validation_success_rate")}

@@ -17,6 +17,7 @@ collide:
 - `length` float32 (n,): of the remaining path, normalised.
 """
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -31,6 +32,7 @@ from roboarm_nmp.utils.random_streams import Stream
 
 AHEAD = 0.1  # normalised: an example's direction is to the point of its path so far ahead
 PER_PATH = 4  # examples of each chosen path, which share the link distances at its goal
+MORE_SCENES = 2**20  # more than a training has
 
 Examples = dict[str, np.ndarray]
 
@@ -65,7 +67,11 @@ class RoadmapExamples:
         """A scene's code, float32 (z,), and its examples. Each `number` >= 0 has its own."""
         rng = np.random.default_rng([self.seed, Stream.ROADMAP_EXAMPLES, number])
         if self.paths is None:
-            scene, paths = random_paths_of_scene(number, self.task, self.seed)
+            # In a scene without room for the arm there may be no path.
+            for index in itertools.count(number, MORE_SCENES):
+                scene, paths = random_paths_of_scene(index, self.task, self.seed)
+                if paths:
+                    break
         else:
             scene, paths = self.paths.random_scene(rng)
         return self.encoder(scene), self._draw(scene, paths, rng)

@@ -117,12 +117,12 @@ def behavioural_cloning():
     return markdown(header, rows)
 
 
-def dagger():
+def roadmap_bc():
     """On `random_boxes_hard`, without and with the safety filter."""
     found, rows = read(RESULTS / "unseen_obstacles.json")[HARD], []
     for encoder in ("point_cloud", "vae", "vqvae", "pointnet2", "field", "oracle"):
-        alone = found[f"dagger, {encoder}, no filter"]
-        filtered = found[f"dagger, {encoder}"]
+        alone = found[f"roadmap BC, {encoder}, no filter"]
+        filtered = found[f"roadmap BC, {encoder}"]
         row = [f"`{encoder}`"]
         row += [share(alone[name]) for name in ("success_rate", "collision_free_success_rate")]
         row += [share(filtered["success_rate"]), interval(filtered)]
@@ -177,7 +177,7 @@ def encoder_scores():
 
 
 def encoder_policies():
-    """Behavioural cloning and DAgger with each encoder, on `random_boxes_hard`."""
+    """Behavioural cloning and roadmap BC with each encoder, on `random_boxes_hard`."""
     unseen, of_paper, rows = read(RESULTS / "unseen_obstacles.json")[HARD], paper(), []
     for encoder in NAMES:
         cloned = runs(f"bc-combined-{encoder}-{HARD}")[:1]
@@ -185,19 +185,19 @@ def encoder_policies():
         row += [share(one["success_rate"]) for one in cloned] or [""]
         row += [interval(one) for one in cloned] or [""]
         row += [of_paper.get(("bc", "combined", HARD, "", "", encoder), "")]
-        imitated = unseen[f"dagger, {encoder}"]
+        imitated = unseen[f"roadmap BC, {encoder}"]
         row += [share(imitated["success_rate"]), interval(imitated)]
         rows.append([*row, share(imitated["collision_free_success_rate"])])
     header = ["encoder", "BC: success", "BC: 95 % interval", "BC: paper's success"]
-    header += ["DAgger with filter: success", "DAgger: 95 % interval"]
-    return markdown([*header, "DAgger: collision-free success"], rows)
+    header += ["Roadmap BC with filter: success", "Roadmap BC: 95 % interval"]
+    return markdown([*header, "Roadmap BC: collision-free success"], rows)
 
 
 TABLES = {
     "sac": lambda: reinforcement("sac"),
     "td3": lambda: reinforcement("td3"),
     "bc": behavioural_cloning,
-    "dagger": dagger,
+    "roadmap_bc": roadmap_bc,
     "encoder runs": encoder_runs,
     "encoder scores": encoder_scores,
     "encoder policies": encoder_policies,
@@ -253,9 +253,9 @@ def save(figure, path):
         image.convert("RGB").quantize(128).save(path, optimize=True)
 
 
-def draw_dagger(path):
+def draw_roadmap_bc(path):
     """Validation success over updates, with and without contacts."""
-    rows = columns("dagger_curves.csv")
+    rows = columns("roadmap_bc_curves.csv")
     reference = read(RESULTS / "baselines.json")[HARD]["go-to-goal"]
     figure, axes = plt.subplots(1, 2, figsize=(7.6, 2.9), sharey=True, layout="constrained")
     for panel, column, key in (
@@ -317,7 +317,7 @@ def draw_all():
     draw(FIGURES / "curves_sac.png", sac, TASKS, steps)
     draw(FIGURES / "curves_td3.png", td3, [t for t in TASKS if "wide" not in t], steps)
     draw(FIGURES / "curves_bc.png", bc, TASKS, "batches")
-    draw_dagger(FIGURES / "curves_dagger.png")
+    draw_roadmap_bc(FIGURES / "curves_roadmap_bc.png")
     draw_encoders(FIGURES / "curves_encoders.png")
 
 

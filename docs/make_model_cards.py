@@ -37,7 +37,7 @@ FIXED = "Policies for one fixed scene. They observe nothing of the scene."
 VARYING = """\
 The goal is a configuration and its end-effector position. The test scenes do not occur in training.
 An observation of ground-truth obstacles is privileged: a robot does not have it.
-`dagger-combined-point_cloud-containers-s1` learned in `containers` and `random_boxes_hard`; its
+`roadmap-bc-combined-point_cloud-containers-s1` learned in `containers` and `random_boxes_hard`; its
 filter has [approach paths](../guide/safety_filter.md#approach-paths).
 Policies in scenes of other kinds: [unseen obstacles](../benchmark/unseen_obstacles.md)."""
 ENCODERS = """\

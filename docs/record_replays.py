@@ -14,7 +14,7 @@ from pathlib import Path
 from mkdocs.utils import get_relative_url
 
 FOLDER = Path(__file__).parent / "recordings"
-POLICY = "dagger-combined-point_cloud-random_boxes_hard-s1"
+POLICY = "roadmap-bc-combined-point_cloud-random_boxes_hard-s1"
 REPLAYS = {
     "demo": ["demo"],
     "shelves": ["view", "narrow_shelves", "--policy", POLICY, "go-to-goal", "--query", "2"],

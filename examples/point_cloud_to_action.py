@@ -23,7 +23,7 @@ from roboarm_nmp.envs.scenes.primitives import ObservedScene
 from roboarm_nmp.evaluation.rollout import rollout
 from roboarm_nmp.policies.registry import find_policy, make_policy
 
-POLICY = "dagger-combined-point_cloud-random_boxes_hard-s1"
+POLICY = "roadmap-bc-combined-point_cloud-random_boxes_hard-s1"
 # Joint angles, rad: from the arm's left to its right.
 START = np.array([1.0, 0.4, 0.0, -1.8, 0.0, 2.2, 0.8], np.float32)
 GOAL = np.array([-1.0, 0.4, 0.0, -1.8, 0.0, 2.2, 0.8], np.float32)

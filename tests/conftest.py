@@ -38,7 +38,7 @@ if importlib.util.find_spec("ompl") is None:
 LONG = (
     "test_browser",
     *("test_trainers", "test_encoder_policies", "test_encoder_trainers", "test_devices"),
-    *("test_td3_her_mp", "test_dagger", "test_bc", "test_collect", "test_own_algorithm"),
+    *("test_td3_her_mp", "test_roadmap_bc", "test_bc", "test_collect", "test_own_algorithm"),
     *("test_evaluation", "test_paper_tables", "test_own_scene", "test_sac_her_mp", "test_learning"),
 )
 

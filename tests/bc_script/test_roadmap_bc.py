@@ -1,9 +1,8 @@
-"""dagger.py: its loss, its policy with a safety filter, a round of DAgger, resumed runs."""
+"""roadmap_bc.py: its loss, its policy with a safety filter, its examples, resumed runs."""
 
 import copy
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import onnx
@@ -27,7 +26,7 @@ from roboarm_nmp.policies.export import save_policy
 from roboarm_nmp.policies.registry import PolicyError, find_policy, make_policy
 from roboarm_nmp.policies.safety_filter import VERSION, SafetyFilter
 
-dagger = load("dagger")
+roadmap_bc = load("roadmap_bc")
 HARD = "random_boxes_hard"
 CPU = torch.device("cpu")
 
@@ -57,18 +56,17 @@ def setting(request, folder, tmp_path_factory):
     source = {"geometry_source": "ground_truth", "link_distances": True}
     env = envs.make(HARD, goal_type="combined", encoder=encoder, **source)
     paths = load_roadmap_paths(folder)
-    args = dagger.Args(token_width=16, hidden_size=32, bf16=False)
-    examples = RoadmapExamples(paths, ground_truth_checker, seed=1)
-    draws = [examples.draw(number, count=256, noise=0.03) for number in range(6)]
-    batch = dagger.concat([dagger.on_device(draw, CPU) for draw in draws])
-    assert set(batch["scene"].tolist()) == {0, 2}
+    args = roadmap_bc.Args(token_width=16, hidden_size=32, bf16=False)
+    make_examples = RoadmapExamples(HARD, paths, env.encoder, ground_truth_checker, 1, count=1536)
+    pool = roadmap_bc.ExamplePool(3, env.encoder.token_size, CPU)
+    for number in range(4):
+        pool.add(*make_examples(number))
+    batch = pool.sample(1500)
+    assert len(torch.unique(batch["observation"][:, 10:], dim=0)) == 2
     torch.manual_seed(1)
-    actor = dagger.Actor(args, env)
+    actor = roadmap_bc.Actor(args, env)
     torch.nn.init.normal_(actor.head.weight)  # (the initial one ignores the scene)
-    latents = torch.as_tensor(env.encoder.encode_demos(paths))
-    latents = dagger.without_padding(latents, actor.token_size)
-    scenes = latents[batch["scene"]]
-    yield actor, env, batch | {"observation": torch.cat([batch["observation"], scenes], dim=1)}
+    yield actor, env, batch
     env.close()
 
 
@@ -84,7 +82,7 @@ def test_update(setting):
     actor, _, batch = setting
     old, actor = copy.deepcopy(actor), copy.deepcopy(actor)
     optimizer = torch.optim.Adam(actor.parameters(), lr=1e-3)
-    losses = list(dagger.update(actor, optimizer, 0.1, batch).values())
+    losses = list(roadmap_bc.update(actor, optimizer, 0.1, batch).values())
     with torch.no_grad():
         direction, length = (x.double().numpy() for x in old.outputs(**inputs_of(batch)))
     label = batch["direction"].double().numpy()
@@ -94,7 +92,7 @@ def test_update(setting):
     assert losses[0].item() == pytest.approx(1.0 - cosine.mean(), abs=1e-5)
     assert losses[1].item() == pytest.approx(smooth.mean(), rel=1e-4)
     for _ in range(30):
-        last = list(dagger.update(actor, optimizer, 0.1, batch).values())
+        last = list(roadmap_bc.update(actor, optimizer, 0.1, batch).values())
     assert last[0] < losses[0] - 0.02 and last[1] < losses[1]
 
 
@@ -103,7 +101,7 @@ def test_initial_action_is_straight_to_the_goal(setting):
     inputs = inputs_of(batch)
     to_goal = inputs["desired_goal"][:, :7] - inputs["observation"][:, :7]
     near = to_goal / to_goal.norm(dim=1, keepdim=True).clamp(min=0.03) * 0.03
-    action = dagger.Actor(dagger.Args(), env)(achieved_goal=None, **inputs)
+    action = roadmap_bc.Actor(roadmap_bc.Args(), env)(achieved_goal=None, **inputs)
     torch.testing.assert_close(action, near)
 
 
@@ -154,29 +152,15 @@ def test_saved_policy_has_its_safety_filter_and_acts_alone_as_in_a_batch(setting
         find_policy(tmp_path / "bad.onnx")
 
 
-def test_round_labels_states_that_the_policy_visits(folder):
-    paths = load_roadmap_paths(folder)
-    examples = RoadmapExamples(paths, ground_truth_checker, seed=1)
-    env = envs.make(HARD, goal_type="combined", horizon=30)
-    visited = []
-
-    def act(observation, desired_goal, **_):
-        visited.append(observation[0, :7].numpy())
-        return 0.03 * torch.nn.functional.normalize(desired_goal[:, :7] - observation[:, :7])
-
-    args = dagger.Args(round_queries=3, round_labels=5)
-    no_filter = SimpleNamespace(filter_policy=lambda act, env, rng: act)
-    new, reached = dagger.dagger_round(act, env, no_filter, examples, args, 40, CPU)
-    assert 0 < len(new["scene"]) <= 15 and 0 <= reached <= 1
-    states = new["observation"][:, :7].numpy()
-    distance = np.abs(states[:, None] - np.array(visited)).max(2).min(1)
-    np.testing.assert_allclose(distance, 0.0, atol=1e-6)
-    torch.testing.assert_close(new["direction"].norm(dim=1), torch.ones(len(states)))
-    again, _ = dagger.dagger_round(act, env, no_filter, examples, args, 40, CPU)
-    other, _ = dagger.dagger_round(act, env, no_filter, examples, args, 80, CPU)
-    assert all(torch.equal(new[name], again[name]) for name in new)
-    assert not torch.equal(new["observation"][:1], other["observation"][:1])
-    env.close()
+def test_pool_has_the_examples_of_the_last_scenes():
+    pool = roadmap_bc.ExamplePool(2, 1, CPU)
+    for number in range(1, 4):
+        rows = np.full(50, number, np.float32)
+        pool.add(np.full(3, number, np.float32), {"observation": rows[:, None], "length": rows})
+        batch = pool.sample(100)
+        expected = {float(last) for last in (number - 1, number) if last}
+        assert set(batch["length"].tolist()) == expected
+        assert (batch["observation"] == batch["length"][:, None]).all()  # with its scene's code
 
 
 # --- Runs
@@ -185,17 +169,16 @@ def test_round_labels_states_that_the_policy_visits(folder):
 def test_killed_and_resumed_run_is_bit_identical_and_evaluated_as_validated(tmp_path, folder):
     flags = ["--paths", str(folder), "--encoder", "point_cloud", "--num-points", "8"]
     flags += ["--safety-margin", "0.012"]
-    whole = run_script("dagger", tmp_path / "whole", *flags)
+    whole = run_script("roadmap_bc", tmp_path / "whole", *flags)
     events = EventAccumulator(str(whole))
     events.Reload()
     for tag in ("success_rate", "collision_free_success_rate", "success_rate_without_filter"):
         assert [event.step for event in events.Scalars(f"eval/{tag}")] == [20, 40]
-    assert [event.step for event in events.Scalars("charts/round_success")] == [15, 30]
 
-    killed = killed_run("dagger", tmp_path / "killed", *flags)
-    run_here(PATHS["dagger"], "--resume", killed)
+    killed = killed_run("roadmap_bc", tmp_path / "killed", *flags)
+    run_here(PATHS["roadmap_bc"], "--resume", killed)
     one, other = (torch.load(run / "checkpoint.pt", weights_only=True) for run in (whole, killed))
-    for name in ("actor", "actor_average", "visited"):
+    for name in ("actor", "actor_average"):
         assert one[name].keys() == other[name].keys() and one[name]
         assert all(torch.equal(one[name][key], other[name][key]) for key in one[name])
 
@@ -212,15 +195,22 @@ def test_killed_and_resumed_run_is_bit_identical_and_evaluated_as_validated(tmp_
 
 
 def test_run_begins_with_the_weights_of_another_policy(tmp_path, folder, short_episodes):
-    flags = ["--paths", str(folder), str(folder), "--encoder", "oracle", "--round-every", "0"]
+    flags = ["--paths", str(folder), str(folder), "--encoder", "oracle"]
     flags += ["--eval-every", "40", "--eval-queries", "1", "--test-queries", "0"]
-    first = run_script("dagger", tmp_path / "first", *flags)
+    first = run_script("roadmap_bc", tmp_path / "first", *flags)
     flags += ["--initial-policy", str(first), "--learning-rate", "1e-9", "--total-updates", "1"]
-    second = run_script("dagger", tmp_path / "second", *flags)
+    second = run_script("roadmap_bc", tmp_path / "second", *flags)
     one, other = (read_weights(run / "policy.onnx") for run in (first, second))
     assert len(one) > 10 and np.abs(one["head.weight"]).max() > 0.001  # it begins with zeros
     for name, weights in one.items():
         np.testing.assert_allclose(other[name], weights, atol=1e-6, rtol=0.0)
+
+
+def test_roadmaps_are_made_in_new_scenes_until_success(tmp_path, short_episodes):
+    flags = ["--paths", "--encoder", "oracle", "--task", "random_boxes_easy", "--workers", "1"]
+    flags += ["--stop-at-success", "0.0", "--eval-queries", "1", "--test-queries", "0"]
+    run = run_script("roadmap_bc", tmp_path, *flags)
+    assert json.loads((run / "result.json").read_text())["steps"] == 20  # the first evaluation
 
 
 @pytest.mark.parametrize(
@@ -230,13 +220,15 @@ def test_run_begins_with_the_weights_of_another_policy(tmp_path, folder, short_e
 def test_initial_policy_that_does_not_fit_is_rejected(tmp_path, folder, policy, message, capsys):
     flags = ["--paths", str(folder), "--initial-policy", policy]
     assert "--initial-policy: " + message.format(policy) in refusal(
-        "dagger", capsys, tmp_path, *flags
+        "roadmap_bc", capsys, tmp_path, *flags
     )
 
 
 def test_goal_poses_are_imitated_saved_and_evaluated(tmp_path, folder, short_episodes):
     flags = ["--paths", str(folder), "--goal-type", "pose", "--eval-queries", "1"]
-    run = run_script("dagger", tmp_path, *flags, "--encoder", "point_cloud", "--num-points", "8")
+    run = run_script(
+        "roadmap_bc", tmp_path, *flags, "--encoder", "point_cloud", "--num-points", "8"
+    )
     assert json.loads((run / "result.json").read_text())["goal_type"] == "pose"
     path, arguments = find_policy(run)
     env = envs.make(HARD, **arguments)
@@ -247,27 +239,26 @@ def test_goal_poses_are_imitated_saved_and_evaluated(tmp_path, folder, short_epi
 
 
 def test_run_on_another_device(tmp_path, folder, another_device, short_episodes):
-    """Updates, a round, an evaluation and a resume, on another device."""
-    few = ["--total-updates", "4", "--eval-every", "4", "--round-every", "2", "--eval-queries", "1"]
+    """Updates, an evaluation and a resume, on another device."""
+    few = ["--total-updates", "4", "--eval-every", "4", "--eval-queries", "1"]
     flags = ["--paths", str(folder), "--encoder", "oracle", *few]
-    run = run_script("dagger", tmp_path, *flags, "--device", another_device)
+    run = run_script("roadmap_bc", tmp_path, *flags, "--device", another_device)
     assert load_network(run / "policy.onnx").metadata["step"] == 4
     assert json.loads((run / "result.json").read_text())["steps"] == 4
     args = json.loads((run / "args.json").read_text())
     assert args["bf16"] is True
     (run / "args.json").write_text(json.dumps(args | {"total_updates": 6}))
-    run_here(PATHS["dagger"], "--resume", run)
+    run_here(PATHS["roadmap_bc"], "--resume", run)
     assert json.loads((run / "result.json").read_text())["steps"] == 6
     state = torch.load(run / "checkpoint.pt", weights_only=True)
     assert state["counts"]["step"] == 6
-    for name in ("actor", "visited"):  # a round came after the resume, too
-        assert {tensor.device.type for tensor in state[name].values()} == {another_device}
+    assert {tensor.device.type for tensor in state["actor"].values()} == {another_device}
 
 
 def test_no_kernel_receives_two_dtypes(tmp_path, folder, short_episodes):
-    few = ["--total-updates", "4", "--eval-every", "4", "--round-every", "2", "--eval-queries", "1"]
+    few = ["--total-updates", "4", "--eval-every", "4", "--eval-queries", "1"]
     with OneType():
-        run_script("dagger", tmp_path, "--paths", str(folder), "--bf16", "True", *few)
+        run_script("roadmap_bc", tmp_path, "--paths", str(folder), "--bf16", "True", *few)
 
 
 @pytest.mark.parametrize(
@@ -276,8 +267,8 @@ def test_no_kernel_receives_two_dtypes(tmp_path, folder, short_episodes):
         (["--paths", "nowhere"], "--paths: nowhere"),
         (["--task", "narrow_shelves"], "narrow_shelves is for testing only"),
         (["--encoder", "lidar"], "--encoder: no such encoder: lidar"),
-        (["--pool-size", "5"], "--pool-size must be at least --examples-per-update"),
+        (["--pool-scenes", "1"], "--first-scenes must be at most --pool-scenes"),
     ],
 )
 def test_bad_flags_are_rejected(tmp_path, flags, message, capsys):
-    assert message in refusal("dagger", capsys, tmp_path, *flags)
+    assert message in refusal("roadmap_bc", capsys, tmp_path, *flags)

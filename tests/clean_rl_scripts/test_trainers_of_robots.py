@@ -26,7 +26,7 @@ PANDAS = "sac-ee-wall-p1-s1"  # a pretrained policy
 SHORT = {
     "td3_her_mp": ["--geometry-source", "ground_truth", "--link-distances"],
     "bc": ["--num-modes", "2", "--eval-every", "600"],
-    "dagger": ["--encoder", "point_cloud", "--round-every", "0", "--eval-every", "40"],
+    "roadmap_bc": ["--encoder", "point_cloud", "--eval-every", "40"],
 }
 SHORT["td3_her_mp"] += ["--demo-prob", "1", "--bc-weight", "2"]
 
@@ -143,5 +143,5 @@ def test_robot_that_cannot_be_used_is_rejected(file, capsys, tmp_path):
     assert "--task: nothing.yaml: No such file" in message
     message = refusal("bc", capsys, tmp_path, "--task", f"boxes@{file}")
     assert "is the Panda's" in message
-    message = refusal("dagger", capsys, tmp_path, "--paths", str(file.parent / "roadmaps"))
+    message = refusal("roadmap_bc", capsys, tmp_path, "--paths", str(file.parent / "roadmaps"))
     assert "--paths: " in message and "made for the robot 'xarm6' " in message

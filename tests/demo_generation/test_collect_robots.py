@@ -13,6 +13,7 @@ from roboarm_nmp.datasets.queries import query_path, validate
 from roboarm_nmp.demo_generation import roadmaps
 from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
 from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.robots.files import load_robot
 
 ROBOTS = ROOT / "examples" / "robots"
@@ -70,7 +71,8 @@ def test_roadmaps_and_examples_have_the_joints_of_the_arm(tmp_path):
     checker = CollisionChecker(paths.scenes[scene])
     for path in paths.of_scene(scene):
         assert checker.is_motion_free(path[:-1], path[1:]).all()
-    examples = RoadmapExamples(paths, CollisionChecker, seed=1).draw(0, 8, 0.03)
+    encoder = make_encoder("oracle")
+    _, examples = RoadmapExamples(args.task, paths, encoder, CollisionChecker, 1, count=8)(0)
     links = checker.link_distances(paths.points[:1]).shape[1:]
     assert examples["observation"].shape == (8, 9) and examples["direction"].shape == (8, 6)
     assert examples["link_distances"].shape == (8, *links) and links[1] == 7

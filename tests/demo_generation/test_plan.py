@@ -13,7 +13,7 @@ from roboarm_nmp.motions.trajectories import load_joint_path, load_trajectory
 from roboarm_nmp.planning.following import follow
 from roboarm_nmp.utils import flags
 
-POLICY = "dagger-combined-point_cloud-random_boxes_hard-s1"
+POLICY = "roadmap-bc-combined-point_cloud-random_boxes_hard-s1"
 
 
 def text(numbers):

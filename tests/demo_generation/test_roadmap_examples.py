@@ -8,12 +8,19 @@ from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths, shard_bytes
 from roboarm_nmp.datasets.shards import shard_path
 from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
 from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
 
 HARD = "random_boxes_hard"
 # A path along two axes, whose remaining length is easily computed.
 CORNER = np.zeros((3, 7), np.float32)
 CORNER[1:, 0], CORNER[2, 1] = 0.5, 0.5
+
+
+def examples_of(paths, count, noise):
+    return RoadmapExamples(
+        HARD, paths, make_encoder("oracle"), ground_truth_checker, 1, count=count, noise=noise
+    )
 
 
 def write_paths(folder, scenes, paths):
@@ -25,7 +32,8 @@ def write_paths(folder, scenes, paths):
 def test_examples_continue_paths_to_either_end(tmp_path):
     scene = envs.get_task(HARD).scene.sample(np.random.default_rng(3))
     paths = load_roadmap_paths(write_paths(tmp_path, [scene], [[CORNER, CORNER + 0.25]]))
-    drawn = RoadmapExamples(paths, ground_truth_checker, seed=1).draw(5, count=96, noise=0.0)
+    code, drawn = examples_of(paths, 96, 0.0)(5)
+    np.testing.assert_array_equal(code, make_encoder("oracle")(scene))
     states, goals = drawn["observation"][:, :7], drawn["desired_goal"][:, :7]
     offset = states[:, 6:]  # of the second path
     assert set(offset.ravel().round(5)) == {0.0, 0.25}
@@ -61,8 +69,8 @@ def test_examples_continue_paths_to_either_end(tmp_path):
 def test_directions_of_noisy_states_lead_back_to_the_path(tmp_path):
     scene = envs.get_task(HARD).base_scene
     paths = load_roadmap_paths(write_paths(tmp_path, [scene], [[CORNER]]))
-    examples = RoadmapExamples(paths, ground_truth_checker, seed=1)
-    one, again, other = (examples.draw(number, 4000, 0.03) for number in (1, 1, 2))
+    examples = examples_of(paths, 4000, 0.03)
+    (_, one), (_, again), (_, other) = (examples(number) for number in (1, 1, 2))
     assert all(np.array_equal(one[name], again[name]) for name in one)
     assert not np.array_equal(one["observation"], other["observation"])
     off = one["observation"][:, 2:7]  # in these joints the path is zero

@@ -54,7 +54,7 @@ def test_page_works_from_top_to_bottom(tmp_path, monkeypatch, capsys):
     assert folder.name in printed["tensorboard --logdir runs"]
     of_run, pretrained, baseline = (
         next(out for line, out in printed.items() if f"evaluate --policy {name}" in line)
-        for name in ("runs/RUN", "dagger", "go-to-goal")
+        for name in ("runs/RUN", "roadmap-bc", "go-to-goal")
     )
     assert folder.name in of_run and "on no_obstacles: 3 test queries" in of_run
     success = [

@@ -34,7 +34,7 @@ from roboarm_nmp.utils.signals import error_line
 
 SCRIPT = ROOT / "clean_rl_scripts" / "evaluate.py"
 HARD = "random_boxes_hard"
-POLICY = "dagger-combined-point_cloud-random_boxes_hard-s1"
+POLICY = "roadmap-bc-combined-point_cloud-random_boxes_hard-s1"
 
 
 @pytest.fixture(scope="module")

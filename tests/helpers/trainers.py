@@ -19,9 +19,9 @@ PATHS = {
     "sac_her_mp": ROOT / "clean_rl_scripts" / "sac_her_mp.py",
     "td3_her_mp": ROOT / "clean_rl_scripts" / "td3_her_mp.py",
     "bc": ROOT / "bc_script" / "bc.py",
-    "dagger": ROOT / "bc_script" / "dagger.py",
+    "roadmap_bc": ROOT / "bc_script" / "roadmap_bc.py",
 }
-# Trainers that need only a task; dagger.py needs roadmap paths.
+# Trainers of policies in fixed scenes.
 TRAINERS = ("sac_her_mp", "td3_her_mp", "bc")
 NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch sees no GPU here")
 GPU = pytest.param("cuda", marks=NO_GPU)  # a `--device`
@@ -30,9 +30,11 @@ TINY += " --horizon 50 --eval-every 300 --eval-queries 2 --test-queries 2 --tota
 TINIER = f"{TINY} --horizon 20 --learning-starts 100 --eval-every 300 --total-timesteps 300"
 TINY_BC = "--hidden-size 16 --batch-size 16 --num-demos 20 --eval-every 300 --eval-queries 2"
 TINY_BC += " --test-queries 2 --total-updates 600"
-TINY_DAGGER = "--hidden-size 16 --token-width 16 --num-blocks 1 --batch-size 16 --pool-size 100"
-TINY_DAGGER += " --examples-per-update 10 --total-updates 40 --round-every 15 --round-queries 1"
-TINY_DAGGER += " --eval-every 20 --eval-queries 2 --test-queries 1 --workers 0"
+TINY_ROADMAP_BC = (
+    "--hidden-size 16 --token-width 16 --num-blocks 1 --batch-size 16 --first-scenes 2"
+)
+TINY_ROADMAP_BC += " --pool-scenes 4 --examples-per-scene 50 --updates-per-scene 10 --workers 0"
+TINY_ROADMAP_BC += " --total-updates 40 --eval-every 20 --eval-queries 2 --test-queries 1"
 # For tests of what training leaves in the checkpoint: one evaluation, on one query.
 ONE_EVALUATION = ["--eval-every", "600", "--eval-queries", "1", "--test-queries", "0"]
 
@@ -72,7 +74,7 @@ def panda_env(goal_type="ee"):
 
 def command(trainer, folder, *flags):
     """A run of seconds; later flags win."""
-    tiny = {"bc": TINY_BC, "dagger": TINY_DAGGER}.get(trainer, TINY).split()
+    tiny = {"bc": TINY_BC, "roadmap_bc": TINY_ROADMAP_BC}.get(trainer, TINY).split()
     return [sys.executable, str(PATHS[trainer]), "--runs-dir", str(folder), *tiny, *flags]
 
 

@@ -10,7 +10,7 @@ from roboarm_nmp.policies import __main__ as command
 from roboarm_nmp.policies.cards import observes, policy_card
 from roboarm_nmp.policies.registry import find_policy, own_safety_filter, pretrained_policies
 
-DAGGER = "dagger-combined-point_cloud-random_boxes_hard-s1"
+PRETRAINED = "roadmap-bc-combined-point_cloud-random_boxes_hard-s1"
 
 
 def test_cards_agree_with_the_files_and_the_measured_results():
@@ -25,8 +25,8 @@ def test_cards_agree_with_the_files_and_the_measured_results():
         assert 0 <= card["collision_free_success_rate"] <= card["success_rate"] <= high
         assert low <= card["success_rate"] and card["num_queries"] >= 400
     measured = json.loads((ROOT / "benchmarks/results/unseen_obstacles.json").read_text())
-    measured = measured["random_boxes_hard"]["dagger, point_cloud"]
-    card = policy_card(DAGGER)
+    measured = measured["random_boxes_hard"]["roadmap BC, point_cloud"]
+    card = policy_card(PRETRAINED)
     for key in ("success_rate", "collision_free_success_rate", "num_queries"):
         assert card[key] == measured[key]
     assert observes(card) == "32 points and link distances from point_cloud"
@@ -47,15 +47,15 @@ def test_policies_and_encoders_are_listed(capsys):
 
 
 def test_one_policy_is_shown_and_a_misspelt_one_is_suggested(capsys):
-    assert command.main([DAGGER]) == 0
+    assert command.main([PRETRAINED]) == 0
     shown = capsys.readouterr().out
     assert "0.9299 (95% interval 0.9247 to 0.9347)" in shown and "0.8531" in shown
-    assert command.main([DAGGER, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == policy_card(DAGGER)
+    assert command.main([PRETRAINED, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == policy_card(PRETRAINED)
     assert command.main(["--json"]) == 0
     listed = json.loads(capsys.readouterr().out)
     assert [card["name"] for card in listed["policies"]] == list(pretrained_policies())
-    assert command.main(["dagger-combined"]) == 2
+    assert command.main(["roadmap-bc-combined"]) == 2
     assert command.main(["sac-ee-wall-s1"]) == 2
     assert "did you mean sac-ee-wall-p1-s1?" in capsys.readouterr().err
 

@@ -79,7 +79,7 @@ def test_policy_with_actions_of_another_mode_is_rejected():
 
 
 def test_pretrained_policy_brings_its_observations_and_its_safety_filter():
-    path, arguments = find_policy("dagger-combined-point_cloud-random_boxes_hard-s1")
+    path, arguments = find_policy("roadmap-bc-combined-point_cloud-random_boxes_hard-s1")
     assert arguments == {
         "goal_type": "combined",
         "encoder": "point_cloud",

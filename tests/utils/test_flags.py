@@ -14,15 +14,15 @@ from roboarm_nmp.utils import flags
 
 ENCODERS = ("vae", "vqvae", "pointnet2", "field")
 PATHS |= {name: ROOT / "scene_embedding_train" / f"{name}.py" for name in ENCODERS}
-POLICIES = ("sac_her_mp", "td3_her_mp", "bc", "dagger")
+POLICIES = ("sac_her_mp", "td3_her_mp", "bc", "roadmap_bc")
 CASES = [
     ("bc", "--seed", "-1"),
     ("bc", "--device", "cuda:99"),
-    ("dagger", "--runs-dir", "/dev/null/runs"),
+    ("roadmap_bc", "--runs-dir", "/dev/null/runs"),
     ("sac_her_mp", "--updates-per-step", "nan"),
     ("td3_her_mp", "--gamma", "1.1"),
     ("bc", "--num-demos", "0"),
-    ("dagger", "--safety-margin", "nan"),
+    ("roadmap_bc", "--safety-margin", "nan"),
     ("pointnet2", "--num-centres", "32 0"),
 ]
 

@@ -25,7 +25,7 @@ from roboarm_nmp.viewer.episodes import (
 )
 from roboarm_nmp.viewer.simulation import PolicyArm, RecordedArm, Simulation
 
-PRETRAINED = "dagger-combined-point_cloud-random_boxes_hard-s1"
+PRETRAINED = "roadmap-bc-combined-point_cloud-random_boxes_hard-s1"
 BLOCKED = 5  # number of a query of `wall` on which go-to-goal touches the wall
 FAR = Box((0.0, 0.0, 1.5), (0.1, 0.1, 0.1))  # from the arm
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from roboarm_nmp.utils import flags
 from roboarm_nmp.viewer.app import PORT, Args, Port, view
 
-TASK, POLICY = "random_boxes_hard", "dagger-combined-point_cloud-random_boxes_hard-s1"
+TASK, POLICY = "random_boxes_hard", "roadmap-bc-combined-point_cloud-random_boxes_hard-s1"
 QUERY = 10  # of the test queries: the policy has no contact, go-to-goal has many
 
 

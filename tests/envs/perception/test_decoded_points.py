@@ -25,7 +25,7 @@ from roboarm_nmp.networks.export import save_network
 from roboarm_nmp.networks.untrusted import NetworkError
 
 BALL = (0.45, 0.1, 0.6, 0.15)  # decoded from every z_E, whatever the scene: position and radius, m
-POLICY = "dagger-combined-point_cloud-random_boxes_hard-s1"
+POLICY = "roadmap-bc-combined-point_cloud-random_boxes_hard-s1"
 
 
 class Constant(torch.nn.Module):

@@ -22,7 +22,7 @@ PLAIN = 20  # the round of attempts without odd flags, in which every command ru
 # Flags whose large numbers only take long.
 LONG = ("total_timesteps", "total_updates", "num", "num_test", "num_validation", "scenes", "trials")
 LONG += ("paths_per_scene", "steps", "horizon", "tries", "num_nodes", "round_queries", "draws")
-LONG += ("num_queries", "round_labels", "attempts", "max_checks", "simplify", "time_limit")
+LONG += ("num_queries", "attempts", "max_checks", "simplify", "time_limit")
 LONG += ("updates_per_step",)
 
 RUN = "--eval-queries 1 --test-queries 1 --runs-dir runs"
@@ -33,9 +33,9 @@ TINY = {
     "clean_rl_scripts.td3_her_mp": RL,
     "bc_script.bc": f"--task wall --hidden-size 8 --batch-size 4 --num-demos 5 {RUN}"
     " --total-updates 4 --eval-every 4",
-    "bc_script.dagger": f"--paths roadmaps --task wall --hidden-size 8 --token-width 8"
-    f" {RUN} --num-blocks 1 --batch-size 4 --pool-size 20 --examples-per-update 4 --total-updates 4"
-    " --eval-every 4 --round-every 2 --round-queries 1",
+    "bc_script.roadmap_bc": f"--paths roadmaps --task wall --hidden-size 8 --token-width 8"
+    f" {RUN} --num-blocks 1 --batch-size 4 --first-scenes 1 --pool-scenes 2 --examples-per-scene 4"
+    " --updates-per-scene 2 --total-updates 4 --eval-every 4",
     "scene_embedding_train.vae": "--observations observations --total-updates 2 --eval-every 2"
     " --batch-size 1 --image-size 16 --width 2 --validation-share 0.5 --runs-dir runs",
     "scene_embedding_train.vqvae": "--observations observations --total-updates 2 --eval-every 2"
