@@ -215,7 +215,7 @@ def test_roadmaps_are_made_in_new_scenes_until_success(tmp_path, short_episodes)
 
 @pytest.mark.parametrize(
     "policy, message",
-    [(f"dagger-combined-point_cloud-{HARD}-s1", "{}: the sizes"), ("nobody", "no such")],
+    [(f"roadmap-bc-combined-point_cloud-{HARD}-s1", "{}: the sizes"), ("nobody", "no such")],
 )
 def test_initial_policy_that_does_not_fit_is_rejected(tmp_path, folder, policy, message, capsys):
     flags = ["--paths", str(folder), "--initial-policy", policy]
