@@ -139,7 +139,7 @@ class Args(RunArgs):
     escape: bool = True
     """escape from local minima"""
 
-    eval_every: flags.PositiveInt = 1_500
+    eval_every: flags.PositiveInt = 1_000
     """updates between evaluations on validation queries"""
 
 

@@ -1,4 +1,4 @@
-"""Roadmaps: many short paths in one scene, and a direction to the goal from any configuration.
+"""Roadmaps: many short paths in one scene.
 
     roboarm roadmaps --task random_boxes_hard --scenes 6000 --output roadmaps
 
@@ -9,7 +9,6 @@ collects paths of many scenes, for `datasets.roadmap_paths.load_roadmap_paths`. 
     roadmap = Roadmap(scene, rng)
     roadmap.random_paths(300, rng)           # 300 paths, each (k, j), normalised
     roadmap.paths(starts, goals, rng)        # paths of given queries; None where there is none
-    roadmap.labels(states, goals, rng)       # direction and length of the path from each state
 
 A roadmap is a probabilistic roadmap (Kavraki et al., 1996). Its nodes are random free
 configurations; its edges are free straight motions to the nearest neighbours. Shortest paths in
@@ -79,9 +78,6 @@ DENSE = 0.15
 GOALS_PER_PATH, SPARE, MAX_ROUNDS = 0.13, 1.1, 10
 # Random chords tried on each path, and the share of its length that each has to save.
 CHORDS, LEAST_GAIN = 40, 0.005
-# A label is the direction to the point at this distance (normalised) along the path: a third of a
-# step of the arm.
-AHEAD = 0.01
 _ROUNDING = 1e-5  # m: largest rounding error of a distance
 _DIFFERENCE = 1e-4  # normalised
 
@@ -217,8 +213,8 @@ class Roadmap:
     def paths(self, starts, goals, rng: np.random.Generator) -> list[np.ndarray | None]:
         """Smoothed paths from starts (n, j) to goals (n, j): a list of float32 (k, j), k > 1.
 
-        None where there is no path. Starts may be in contact, as for `labels`. Many queries with
-        few different goals are fast.
+        None where there is no path. Starts may be in contact: a path from a contact deeper than
+        `INSIDE` first leaves the obstacle. Many queries with few different goals are fast.
         """
         # The simulated arm may be a little beyond its limits.
         starts = np.clip(np.asarray(starts, np.float64), -1.0, 1.0).reshape(-1, self._joints)
@@ -249,28 +245,6 @@ class Roadmap:
                 # A path whose start is its goal has two points all the same.
                 paths[i] = path[np.r_[True, moves]] if moves.any() else path[:2]
         return paths
-
-    def labels(self, states, goals, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Direction and length of a path from each of the states (n, j) to its goal (n, j).
-
-        States may be in contact. Where a state is closer than the margin, its path begins at its
-        own distance. From a contact deeper than `INSIDE`, the path first leaves the obstacle.
-
-        Returns:
-            directions: float32 (n, j), unit vectors towards the path's point after `AHEAD`. Zeros
-                where the state is its goal, NaN where there is no path.
-            lengths: float32 (n,), of the path, L2, normalised. NaN where there is none.
-        """
-        directions = np.full((len(states), self._joints), np.nan, np.float32)
-        lengths = np.full(len(states), np.nan, np.float32)
-        for i, path in enumerate(self.paths(states, goals, rng)):
-            if path is not None:
-                steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-                travelled = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
-                move = [np.interp(AHEAD, travelled, values) for values in path.T] - path[0]
-                directions[i] = move / max(np.linalg.norm(move), 1e-12)
-                lengths[i] = travelled[-1]
-        return directions, lengths
 
     def _distances(self, states: np.ndarray) -> np.ndarray:
         """Distances (m) of the arm from obstacles and from itself; negative in contact."""
