@@ -42,10 +42,6 @@ def along(path, spacing=0.02):
     return np.concatenate(pieces)
 
 
-def length(path):
-    return np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
-
-
 @pytest.fixture(scope="module")
 def roadmap():
     return Roadmap(hard_scene(3), np.random.default_rng(0))

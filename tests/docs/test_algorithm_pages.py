@@ -21,7 +21,7 @@ def test_tables_show_the_results_in_the_data_files(name):
 
 @pytest.mark.parametrize("name", ["sac", "td3", "bc", "roadmap_bc"])
 def test_flag_tables_show_the_defaults(name):
-    Args = importlib.import_module(f"roboarm_nmp.{TRAINERS[name][0]}").Args
+    Args = importlib.import_module(f"roboarm_nmp.{TRAINERS[name.replace('_', '-')][0]}").Args
     words, defaults = load("make_command_line").words, vars(Args())
     rows = re.findall(r"^\| `--([\w-]+)` \| (.*?) \|", (PAGES / f"{name}.md").read_text(), re.M)
     assert len(rows) >= 7
