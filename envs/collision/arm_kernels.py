@@ -22,13 +22,15 @@ FAR = 1e9  # m: farther than anything
 # of its core: a box or a cylinder less its rounding, a sphere's centre, or a link's hull. Rows of
 # obstacles may have a column more for each body of the arm, which is 1 if that may touch the shape.
 # Kinds are those of `envs.scenes.primitives.to_array`, and `LINK`.
-CYLINDER, SPHERE, LINK = 1, 2, 3
+BOX, CYLINDER, SPHERE, LINK = 0, 1, 2, 3
 ROW = 18
+SIMPLEX = 32  # numbers that GJK works with
 
 
 # Columns of `arm`'s first two arrays, see `hulls.arm_hulls`.
 PARENT, JOINT, PRISMATIC, BEGIN, SPAN, POSITION, ROTATION, FRAME_COLUMNS = 0, 1, 2, 3, 4, 5, 8, 17
-FRAME, CENTRE, RADIUS, HALF, ROUNDING, LINK_ROW, BODY_COLUMNS = 0, 1, 4, 5, 8, 9, 10
+FRAME, CENTRE, RADIUS, HALF, ROUNDING, LINK_ROW = 0, 1, 4, 5, 8, 9
+SHARP, CORNERS, BODY_COLUMNS = 10, 11, 12
 
 
 @compiled
@@ -38,7 +40,7 @@ def working_memory(chain, bodies):
         np.zeros((chain.shape[0], 12)),
         np.empty((bodies.shape[0], 3)),
         np.zeros(12),
-        np.empty(32),
+        np.empty(SIMPLEX + ROW),
         np.zeros((1, ROW)),
     )
 

@@ -10,11 +10,11 @@
 
 The shapes are PyBullet's, so the answers are those of `RoboArmEnv.in_collision`, without a PyBullet
 world. The shapes are: the convex hulls of the links' collision meshes, and of obstacles,
-`BULLET_MARGIN` thicker on all sides; boxes and cylinders, with edges rounded by as much; spheres;
-the table and the floor. Of links, the robot's `self_collision_pairs` are checked. As in PyBullet,
-the base collides only with the arm itself. An obstacle is not there for links in its `may_touch`.
-Objects attached to the arm belong to the links that carry them, with self-collision pairs of their
-own. How often the two disagree: docs/benchmark/performance.md.
+`BULLET_MARGIN` thicker on all sides; boxes and cylinders, with edges rounded by as much, but sharp
+between two boxes; spheres; the table and the floor. Of links, the robot's `self_collision_pairs`
+are checked. As in PyBullet, the base collides only with the arm itself. An obstacle is not there
+for links in its `may_touch`. Objects attached to the arm belong to the links that carry them, with
+self-collision pairs of their own. How often the two disagree: docs/benchmark/performance.md.
 
 Two shapes are compared in three stages, each only if the one before could not separate them: the
 link's bounding sphere against the box around the obstacle; the link's bounding box against that

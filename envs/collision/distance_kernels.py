@@ -14,6 +14,8 @@ from roboarm_nmp.envs.collision.arm_kernels import (
     RADIUS,
     ROUNDING,
     ROW,
+    SHARP,
+    SIMPLEX,
     SPAN,
     place_arm,
     working_memory,
@@ -21,6 +23,7 @@ from roboarm_nmp.envs.collision.arm_kernels import (
 from roboarm_nmp.envs.collision.gjk_kernels import (
     GJK_TOLERANCE,
     begin_gjk,
+    both_boxes,
     box_gap,
     box_gaps,
     boxes_apart,
@@ -30,6 +33,7 @@ from roboarm_nmp.envs.collision.gjk_kernels import (
     sphere_gap,
     support,
     write_body_row,
+    write_sharp_row,
 )
 from roboarm_nmp.utils.numba_cache import compiled
 
@@ -141,7 +145,23 @@ def _signed_distance(bodies, vertices, cells, k, rows, j, frames, centres, pose,
     relative_pose(rows, j, frames, int(bodies[k, FRAME]), centres, k, pose)
     if boxes_apart(bodies, k, rows, j, pose, far):
         return FAR
+    if both_boxes(bodies, k, rows, j):
+        return _boxes_distance(bodies, vertices, cells, k, rows, j, pose, s, far, polytope)
     return _core_distance(vertices, cells, k, rows, j, pose, s, far, polytope)
+
+
+@compiled
+def _boxes_distance(bodies, vertices, cells, k, rows, j, pose, s, far, polytope):
+    """`_signed_distance` of the cores of two boxes, if their surfaces had no rounding."""
+    sharp = s[None, SIMPLEX:]
+    write_sharp_row(bodies, rows, j, sharp)
+    rounding, body = bodies[k, ROUNDING] + rows[j, 16], int(bodies[k, SHARP])
+    distance = _core_distance(vertices, cells, body, sharp, 0, pose, s, far - rounding, polytope)
+    if distance == FAR:
+        return FAR
+    for i in range(3):  # the witness is a point of the core
+        s[24 + i] += bodies[k, ROUNDING] * s[28 + i]
+    return distance + rounding
 
 
 @compiled

@@ -6,17 +6,24 @@ What the arguments hold: `arm_kernels`.
 import math
 
 from roboarm_nmp.envs.collision.arm_kernels import (
+    BOX,
+    CORNERS,
     CYLINDER,
     FAR,
     FRAME,
     HALF,
     LINK,
     ROUNDING,
+    ROW,
+    SHARP,
+    SIMPLEX,
 )
 from roboarm_nmp.utils.numba_cache import compiled, uncounted
 
 BULLET_MARGIN = 0.001
-"""m. PyBullet thickens a link's hull by this, and rounds the edges of boxes and cylinders."""
+"""m. PyBullet thickens a link's hull by this, and rounds the edges of boxes and cylinders.
+
+Only between two boxes edges are sharp: Bullet has a detector of their contacts alone."""
 
 
 # Each face of the cube of directions has this many cells squared, see `hulls._cells`.
@@ -25,6 +32,8 @@ CELLS = 8
 GJK_TOLERANCE, _MAX_ITERATIONS = 1e-8, 64
 # m: more than rounding can change a distance by.
 ROUNDING_ERROR = 1e-9
+# Bullet makes two boxes overlap by this share of their half edges where two edges meet.
+_EDGE_FUDGE = 1e-5
 
 
 @uncounted
@@ -320,6 +329,112 @@ def write_body_row(bodies, k, frames, centres, row):
 
 
 @uncounted
+def both_boxes(bodies, k, rows, j):
+    """Whether a body and a shape are boxes."""
+    if bodies[k, CORNERS] < 0.0:
+        return False
+    if rows[j, 0] != LINK:
+        return rows[j, 0] == BOX
+    other = int(rows[j, 17])  # or a convex hull's, which is none of the arm's
+    return other < bodies.shape[0] and bodies[other, CORNERS] >= 0.0
+
+
+@uncounted
+def write_sharp_row(bodies, rows, j, sharp):
+    """Write a box, a row of `rows`, without its rounding to `sharp` (1, `ROW`)."""
+    for i in range(ROW):
+        sharp[0, i] = rows[j, i]
+    for i in range(3):
+        sharp[0, 13 + i] += rows[j, 16]
+    sharp[0, 16] = 0.0
+    if rows[j, 0] == LINK:
+        sharp[0, 17] = bodies[int(rows[j, 17]), SHARP]
+
+
+@uncounted
+def _write_box(vertices, corners, s, n):
+    """Write a box's axes, in its frame, to s[n:n+9], and its half edges (m) to s[n+9:n+12]."""
+    for axis in range(3):
+        squared = 0.0
+        for i in range(3):
+            # Corners are in the order of binary numbers, with x the most significant.
+            edge = (vertices[corners + (4 >> axis), i] - vertices[corners, i]) / 2
+            s[n + 3 * axis + i] = edge
+            squared += edge * edge
+        s[n + 9 + axis] = math.sqrt(squared)
+        for i in range(3):
+            s[n + 3 * axis + i] /= s[n + 9 + axis]
+
+
+@uncounted
+def _box_reach(s, n, x, y, z):
+    """How far (m) the box at s[n:n+12] reaches along (x, y, z) from its centre."""
+    reach = 0.0
+    for axis in range(3):
+        i = n + 3 * axis
+        reach += s[n + 9 + axis] * abs(s[i] * x + s[i + 1] * y + s[i + 2] * z)
+    return reach
+
+
+@uncounted
+def _boxes_separated(bodies, vertices, k, rows, j, pose, s, gap):
+    """Whether two boxes are more than `gap` (m, at most 0) apart, as Bullet's `dBoxBox2` says.
+
+    The 15 axes that can separate them are the normals of faces, and those of pairs of edges.
+    """
+    _write_box(vertices, int(bodies[k, CORNERS]), s, 0)
+    if rows[j, 0] == LINK:
+        _write_box(vertices, int(bodies[int(rows[j, 17]), CORNERS]), s, 12)
+    else:
+        for n in range(3):
+            s[21 + n] = rows[j, 13 + n] + rows[j, 16]
+            for i in range(3):
+                s[12 + 3 * n + i] = 1.0 if i == n else 0.0
+    for n in range(12, 21, 3):  # into the body's frame
+        x, y, z = s[n], s[n + 1], s[n + 2]
+        for i in range(3):
+            s[n + i] = pose[3 * i] * x + pose[3 * i + 1] * y + pose[3 * i + 2] * z
+    halves = s[9] + s[10] + s[11] + s[21] + s[22] + s[23]
+    for n in range(15):
+        fudge = 0.0
+        if n < 6:
+            i = 3 * n if n < 3 else 3 * n + 3
+            x, y, z = s[i], s[i + 1], s[i + 2]
+        else:
+            a, b = (n - 6) // 3, (n - 6) % 3
+            i, m = 3 * a, 12 + 3 * b
+            x = s[i + 1] * s[m + 2] - s[i + 2] * s[m + 1]
+            y = s[i + 2] * s[m] - s[i] * s[m + 2]
+            z = s[i] * s[m + 1] - s[i + 1] * s[m]
+            fudge = _EDGE_FUDGE * (halves - s[9 + a] - s[21 + b])
+        reach = _box_reach(s, 0, x, y, z) + _box_reach(s, 12, x, y, z) + fudge
+        away = abs(pose[9] * x + pose[10] * y + pose[11] * z)
+        if away - reach > gap * math.sqrt(x * x + y * y + z * z):
+            return True
+    return False
+
+
+@uncounted
+def _boxes_apart_by(bodies, vertices, cells, k, rows, j, pose, s, gap):
+    """`apart_by` of two boxes. `gap` includes their rounding, which they do not have here."""
+    rounding = bodies[k, ROUNDING] + rows[j, 16]
+    margin = gap - rounding
+    if abs(margin) < ROUNDING_ERROR:
+        margin = 0.0
+    if not _boxes_separated(bodies, vertices, k, rows, j, pose, s, min(margin, 0.0)):
+        return -FAR
+    if margin > 0.0:
+        sharp = s[None, SIMPLEX:]
+        write_sharp_row(bodies, rows, j, sharp)
+        begin_gjk(sharp, 0, pose, s)
+        body = int(bodies[k, SHARP])
+        if gjk(vertices, cells, body, sharp, 0, pose, s, margin, margin)[0] < margin:
+            return -FAR
+        return max(s[31] + rounding, gap)
+    return gap
+
+
+@uncounted
 def apart_by(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap, axes, n):
     """`_is_apart`, with a lower bound (m) of the distance, at least `gap`; -`FAR` if it is nearer.
 
@@ -329,6 +444,8 @@ def apart_by(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap,
     """
     f = int(bodies[k, FRAME])
     relative_pose(rows, j, frames, f, centres, k, pose)
+    if both_boxes(bodies, k, rows, j):
+        return _boxes_apart_by(bodies, vertices, cells, k, rows, j, pose, s, gap)
     if axes.shape[0] > 0 and (axes[n, 0] != 0.0 or axes[n, 1] != 0.0 or axes[n, 2] != 0.0):
         x = frames[f, 0] * axes[n, 0] + frames[f, 3] * axes[n, 1] + frames[f, 6] * axes[n, 2]
         y = frames[f, 1] * axes[n, 0] + frames[f, 4] * axes[n, 1] + frames[f, 7] * axes[n, 2]

@@ -13,6 +13,7 @@ from roboarm_nmp.envs.collision.arm_kernels import (
     BEGIN,
     BODY_COLUMNS,
     CENTRE,
+    CORNERS,
     FRAME,
     FRAME_COLUMNS,
     HALF,
@@ -26,6 +27,7 @@ from roboarm_nmp.envs.collision.arm_kernels import (
     ROTATION,
     ROUNDING,
     ROW,
+    SHARP,
     SPAN,
     SPHERE,
 )
@@ -55,8 +57,9 @@ def arm_hulls(robot: Robot) -> tuple[np.ndarray, ...]:
       the joint's value at -1 and its range, position 3 and rotation 9 in the parent;
     - `bodies`: float64 (b, `BODY_COLUMNS` + f): the frame in which a body moves, the centre of its
       bounding box there 3, the radius of the sphere around that centre, half edges 3, rounding (m),
-      and the link's row of link distances (`Robot.link_rows`), -1 for those that do not move, which
-      come first; then `_levers`;
+      the link's row of link distances (`Robot.link_rows`), -1 for those that do not move, which
+      come first; of a box, which has a second mesh, without rounding, that mesh and the first of
+      its vertices, of other bodies -1; then `_levers`;
     - `pairs`: int64 (p, 2), the bodies that may collide;
     - `vertices`: float64 (v, 3), m, relative to their body's centre;
     - `cells`: see `_cells`.
@@ -71,9 +74,9 @@ def arm_hulls(robot: Robot) -> tuple[np.ndarray, ...]:
         row[SPAN] = frame.multiplier * span[frame.joint]
         row[POSITION:ROTATION] = frame.position
         row[ROTATION:] = _exact(frame.rotation)
-    bodies, meshes = [], []
+    bodies, meshes, boxes = [], [], []
     of_link = {link.index: [] for link in robot.links}
-    for link, mesh, rounding, _ in link_shapes(robot):
+    for link, mesh, rounding, surface in link_shapes(robot):
         centre = (mesh.min(0) + mesh.max(0)) / 2
         mesh = mesh - centre
         body = np.empty(BODY_COLUMNS)
@@ -81,6 +84,13 @@ def arm_hulls(robot: Robot) -> tuple[np.ndarray, ...]:
         body[RADIUS] = np.linalg.norm(mesh, axis=1).max()
         body[HALF:ROUNDING], body[ROUNDING] = mesh.max(0), rounding
         body[LINK_ROW] = robot.link_rows.get(link.index, -1)
+        body[SHARP] = body[CORNERS] = -1
+        if not np.array_equal(mesh, surface - centre):
+            # Two boxes may touch where their cores with the rounding do not: that rounding counts
+            # twice in what excludes distant shapes.
+            body[RADIUS] = np.linalg.norm(surface - centre, axis=1).max() + rounding
+            body[HALF:ROUNDING] = (surface - centre).max(0) + rounding
+            boxes.append((body, surface - centre))
         of_link[link.index].append(len(bodies))
         bodies.append(body)
         meshes.append(mesh)
@@ -88,6 +98,9 @@ def arm_hulls(robot: Robot) -> tuple[np.ndarray, ...]:
     for a, b in robot.self_collision_pairs:
         pairs += itertools.product(of_link[a], of_link[b])
     pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    for body, surface in boxes:
+        body[SHARP], body[CORNERS] = len(meshes), sum(map(len, meshes))
+        meshes.append(surface)
     bodies = np.reshape(bodies, (-1, BODY_COLUMNS))
     bodies = np.concatenate([bodies, _levers(chain, bodies)], axis=1)
     return chain, bodies, pairs, np.concatenate(meshes), _cells(meshes)
@@ -285,8 +298,9 @@ def world_shapes(obstacles: Sequence, robot: Robot) -> tuple[np.ndarray, tuple[n
     if not hulls:
         return rows, arm
     chain, bodies, pairs, vertices, cells = arm
+    num_meshes = (cells[0] - 1) // (6 * CELLS**2)
     rows[[isinstance(obstacle, ConvexHull) for obstacle in obstacles], 17] = np.arange(
-        len(bodies), len(bodies) + len(hulls)
+        num_meshes, num_meshes + len(hulls)
     )
     for hull in hulls:
         _, mesh, own_cells = _hull(hull.vertices)

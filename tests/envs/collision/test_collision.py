@@ -22,7 +22,9 @@ from roboarm_nmp.envs.collision.checker import (
 )
 from roboarm_nmp.envs.collision.gjk_kernels import BULLET_MARGIN
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.urdf import robot_from_urdf
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
+from roboarm_nmp.envs.world import World
 from roboarm_nmp.utils.bullet import pybullet as p
 
 # Stretched out, upwards and to the front, and far from itself.
@@ -105,21 +107,43 @@ def near_contact(checker, rng, number):
     return states[:number]
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_random_scenes_agree_with_pybullet(env, seed):
-    rng = np.random.default_rng(seed)
-    scene = random_scene(rng)
-    env.set_scene(scene)
+def arm_of_boxes(folder):
+    """Seven joints between links that are boxes, some of which are turned in their links."""
+    inertial = '<inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" {}/></inertial>'
+    inertial = inertial.format('ixy="0" ixz="0" iyz="0"')
+    elements = ""
+    for i in range(8):
+        elements += (
+            f'<link name="l{i}">{inertial}<collision><origin xyz="0 0 .1" rpy="{i // 4} 0 0"/>'
+        )
+        elements += '<geometry><box size=".05 .06 .16"/></geometry></collision></link>'
+    for i in range(7):
+        elements += f'<joint name="j{i}" type="revolute"><parent link="l{i}"/>'
+        elements += (
+            f'<child link="l{i + 1}"/><origin xyz="0 0 .2"/><axis xyz="{i % 2} 1 {i // 4}"/>'
+        )
+        elements += '<limit lower="-2.5" upper="2.5" effort="50" velocity="1"/></joint>'
+    (folder / "boxes.urdf").write_text(f'<robot name="boxes">{elements}</robot>')
+    return robot_from_urdf(folder / "boxes.urdf")
+
+
+@pytest.mark.parametrize("name", ["panda", "boxes"])
+def test_random_scenes_agree_with_pybullet(tmp_path, name):
+    """Bullet's boxes have sharp edges towards boxes, and rounded ones towards other shapes."""
+    rng = np.random.default_rng(1)
+    robot = PANDA if name == "panda" else arm_of_boxes(tmp_path)
+    scene = replace(random_scene(rng), robot=robot)
+    world = World(scene, drawn=False)
     checker = CollisionChecker(scene)
     for states in (rng.uniform(-1, 1, (200, 7)), near_contact(checker, rng, 200)):
-        theirs = [not env.in_collision(c) for c in PANDA.denormalise(states)]
+        theirs = [not world.in_collision(c) for c in robot.denormalise(states)]
         np.testing.assert_array_equal(checker.is_free(states), theirs)
         assert 0.05 < np.mean(theirs) < 0.95
     # The states near contact distinguish a millimetre.
     assert (checker.is_free(states, margin=0.001) != theirs).mean() > 0.05
     # A distance is negative in a collision and nowhere else.
     np.testing.assert_array_equal(checker.signed_distances(states).distance.min(-1) >= 0, theirs)
-    env.set_scene(EMPTY)
+    world.close()
 
 
 def test_starts_and_goals_of_queries_are_free():
