@@ -1,6 +1,7 @@
 """Saving and loading networks: the same results for any batch size, and never a stranger's code."""
 
 import json
+import math
 import os
 import resource
 import shutil
@@ -10,10 +11,9 @@ import time
 from pathlib import Path
 
 import numpy as np
-import onnx
+import onnx.parser
 import pytest
 import torch
-from onnx import TensorProto, helper
 from torch import nn
 
 from roboarm_nmp.networks import untrusted
@@ -207,234 +207,127 @@ def test_inputs_are_checked_when_it_is_called(saved):
         load_network(saved, provider="NoExecutionProvider")
 
 
-def _model(nodes, tensors=(), shape=("N", 3), opset=20):
-    """A model from `x` to `y`, made by hand."""
-    graph = helper.make_graph(
-        nodes,
-        "main",
-        [helper.make_tensor_value_info("x", TensorProto.FLOAT, shape)],
-        [helper.make_tensor_value_info("y", TensorProto.FLOAT, None)],
-        list(tensors),
-    )
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=10)
-
-
-def _constant(name, values, dtype=np.int64):
-    return onnx.numpy_helper.from_array(np.array(values, dtype), name)
-
-
-def _external(folder):
-    (folder / "secret").write_bytes(bytes(12))
-    tensor = _constant("w", np.zeros(3), np.float32)
-    onnx.external_data_helper.set_external_data(tensor, "secret")
-    tensor.ClearField("raw_data")
-    return _model([helper.make_node("Add", ["x", "w"], ["y"])], [tensor])
-
-
-def _loop(folder):
-    """A billion rounds."""
-    body = helper.make_graph(
-        [
-            helper.make_node("Identity", ["go"], ["go_on"]),
-            helper.make_node("Sin", ["v"], ["w"]),
-        ],
-        "body",
-        [
-            helper.make_tensor_value_info("i", TensorProto.INT64, []),
-            helper.make_tensor_value_info("go", TensorProto.BOOL, []),
-            helper.make_tensor_value_info("v", TensorProto.FLOAT, None),
-        ],
-        [
-            helper.make_tensor_value_info("go_on", TensorProto.BOOL, []),
-            helper.make_tensor_value_info("w", TensorProto.FLOAT, None),
-        ],
-    )
-    loop = helper.make_node("Loop", ["number", "true", "x"], ["y"], body=body)
-    return _model([loop], [_constant("number", 10**9), _constant("true", True, bool)])
-
-
-def _custom(folder):
-    return _model([helper.make_node("Evil", ["x"], ["y"], domain="com.example")])
-
-
-def _function(folder):
-    model = _model([helper.make_node("Abs", ["x"], ["y"])])
-    abs_node = helper.make_node("Neg", ["a"], ["b"])
-    imports = [helper.make_opsetid("", 20)]
-    model.functions.append(helper.make_function("", "Abs", ["a"], ["b"], [abs_node], imports))
-    return model
-
-
-def _filled(folder):
-    """Without inputs, so that it would be computed when the file is loaded."""
-    nodes = [
-        helper.make_node("ConstantOfShape", ["size"], ["big"]),
-        helper.make_node("ReduceSum", ["big"], ["sum"], keepdims=0),
-        helper.make_node("Add", ["x", "sum"], ["y"]),
-    ]
-    return _model(nodes, [_constant("size", [2**20, 2**20])])
-
-
-def _expanded(folder):
-    nodes = [
-        helper.make_node("Expand", ["x", "size"], ["big"]),
-        helper.make_node("ReduceMax", ["big"], ["y"], keepdims=0),
-    ]
-    return _model(nodes, [_constant("size", [2**20, 2**14, 3])])
-
-
-def _slow(folder):
-    """Large products, each of small tensors."""
-    nodes = [helper.make_node("Expand", ["one", "size"], ["a0"])]
-    nodes += [helper.make_node("MatMul", [f"a{i}", f"a{i}"], [f"a{i + 1}"]) for i in range(7)]
-    nodes += [helper.make_node("ReduceMax", ["a7"], ["max"], keepdims=0)]
-    nodes += [helper.make_node("Add", ["x", "max"], ["y"])]
-    return _model(nodes, [_constant("one", 1, np.float32), _constant("size", [4096, 4096])])
-
-
-def _divided(folder):
-    """An integer by zero: the process would end."""
-    nodes = [
-        helper.make_node("Cast", ["x"], ["i"], to=TensorProto.INT64),
-        helper.make_node("Div", ["i", "zero"], ["j"]),
-        helper.make_node("Cast", ["j"], ["y"], to=TensorProto.FLOAT),
-    ]
-    return _model(nodes, [_constant("zero", 0)])
-
-
-def _data_dependent(folder):
-    nodes = [
-        helper.make_node("Cast", ["x"], ["i"], to=TensorProto.INT64),
-        helper.make_node("Squeeze", ["i", "axis"], ["size"]),
-        helper.make_node("ConstantOfShape", ["size"], ["y"]),
-    ]
-    return _model(nodes, [_constant("axis", [0])])
-
-
-def _many(folder):
-    nodes = [helper.make_node("Abs", [f"v{i}" if i else "x"], [f"v{i + 1}"]) for i in range(25_000)]
-    return _model([*nodes, helper.make_node("Abs", ["v25000"], ["y"])])
-
-
-def _incomplete(folder):
-    tensor = _constant("w", np.zeros(1_000), np.float32)
-    tensor.dims[0] = 2**24
-    return _model([helper.make_node("Gather", ["w", "i"], ["y"])], [tensor, _constant("i", [0])])
-
-
-def _inconsistent(folder):
-    weights = _constant("w", np.zeros((4, 4)), np.float32)
-    return _model([helper.make_node("MatMul", ["x", "w"], ["y"])], [weights])
-
-
-def _one(operator, *sizes, outputs=("y",), **attributes):
-    """A model of one operator: of `x` and of stored tensors of some sizes."""
-    tensors = [_constant(f"w{i}", np.zeros(size), np.float32) for i, size in enumerate(sizes)]
-    names = ["x", *(tensor.name for tensor in tensors)]
-    return _model([helper.make_node(operator, names, outputs, **attributes)], tensors)
-
-
-def _axis(folder):
-    return _one("LayerNormalization", 3, outputs=("y", "mean"), axis=2**31)
-
-
-def _missing(folder):
-    model = _one("LayerNormalization", 3)
-    model.graph.node[0].input.append("")
-    return model
-
-
-def _outputs(folder):
-    return _one("Split", outputs=("y", "z", "w"), axis=1, num_outputs=1)
-
-
-def _negative(folder):
-    nodes = [helper.make_node("GatherND", ["x", "indices"], ["y"], batch_dims=-(2**31))]
-    return _model(nodes, [_constant("indices", [[0]])])
-
-
-def _negative_input(folder):
-    nodes = [helper.make_node("Slice", ["x", "from", "to"], ["y"])]
-    return _model(nodes, [_constant("from", [0]), _constant("to", [1])], shape=(-1, 3))
-
-
-def _text(folder):
-    return _one("Cast", to=TensorProto.STRING)
-
-
-def _read(folder):
-    """Little is computed, but from much, and again and again."""
-    nodes = [helper.make_node("Expand", ["x", "size"], ["big"])]
-    nodes += [helper.make_node("ReduceLogSumExp", ["big"], [f"v{i}"]) for i in range(1_000)]
-    nodes += [helper.make_node("Max", [f"v{i}" for i in range(1_000)], ["y"])]
-    return _model(nodes, [_constant("size", [2**20, 3])])
-
-
-def _long(folder):
-    """A vector, which ONNX could take for sizes, of a hundred bytes each."""
-    nodes = [helper.make_node("Expand", ["one", "size"], ["v0"])]
-    nodes += [helper.make_node("Add", [f"v{i}", f"v{i}"], [f"v{i + 1}"]) for i in range(9)]
-    return _model(
-        [*nodes, helper.make_node("ReduceMax", ["v9"], ["y"])],
-        [_constant("one", [1]), _constant("size", [2**22])],
+def _model(nodes, stored="", x="float[N, 3]", imports="", functions=""):
+    """A model from `x` to `y`, in ONNX's text format."""
+    return onnx.parser.parse_model(
+        f'<ir_version: 10, opset_import: ["": 20{imports}]> '
+        f"main ({x} x) => (float[] y) <{stored}> {{ {nodes} }} {functions}"
     )
 
 
-def _patches(folder):
-    """A small image and a small result; between them, a matrix of gigabytes."""
-    nodes = [
-        helper.make_node("Expand", ["x", "size"], ["image"]),
-        helper.make_node("ConvTranspose", ["image", "w"], ["y"], pads=[250] * 4),
-    ]
-    weights = _constant("w", np.zeros((1, 1, 40, 40)), np.float32)
-    return _model(nodes, [_constant("size", [1, 1, 512, 512]), weights], shape=("N", 1))
+def _zeros(*sizes):
+    return f"float[{', '.join(map(str, sizes))}] w = {{{', '.join('0' * math.prod(sizes))}}}"
 
 
-def _renamed(folder):
-    """A result with the name of a stored tensor: which of them would be the size?"""
-    value = _constant("", [2**40])
-    nodes = [
-        helper.make_node("Constant", [], ["size"], value=value),
-        helper.make_node("Expand", ["one", "size"], ["big"]),
-        helper.make_node("ReduceMax", ["big"], ["max"], keepdims=0),
-        helper.make_node("Add", ["x", "max"], ["y"]),
-    ]
-    return _model(nodes, [_constant("size", [1]), _constant("one", 1, np.float32)])
-
-
+# Of each: what the message says, and arguments of `_model`.
 HOSTILE = {
-    _external: "its tensors are in another file",
-    _loop: "the operator Loop is not allowed",
-    _custom: "the operator com.example.Evil is not allowed",
-    _function: "it holds functions",
-    _filled: "ConstantOfShape computes more than 16,777,216 numbers",
-    _expanded: "Expand computes more than 16,777,216 numbers",
-    _slow: "it computes too much",
-    _divided: "it divides integers",
-    _axis: "LayerNormalization has a wrong axis",
-    _missing: "LayerNormalization lacks an input",
-    _outputs: "Split has a wrong num_outputs",
-    _negative: "GatherND has a wrong batch_dims",
-    _negative_input: "the size of x is not positive",
-    _text: "it holds text",
-    _read: "it computes too much",
-    _long: "it computes too much",
-    _patches: "it computes too much",
-    _renamed: "a result of Constant has the name of another tensor",
-    _data_dependent: "the shape of a result of ConstantOfShape depends on values",
-    _many: "it has 25,001 operators, not 1 to 10,000",
-    _incomplete: "damaged",
-    _inconsistent: "damaged",
+    "external": (
+        "its tensors are in another file",
+        "y = Add(x, w)",
+        'float[3] w = ["location": "secret"]',
+    ),
+    "billion rounds": (
+        "the operator Loop is not allowed",
+        "y = Loop(rounds, go, x) <body = body (int64 i, bool go, float[M, 3] v) =>"
+        "(bool go_on, float[M, 3] w) { go_on = Identity(go) w = Sin(v) }>",
+        "int64 rounds = {1000000000}, bool go = {1}",
+    ),
+    "custom": (
+        "the operator com.example.Evil is not allowed",
+        "y = com.example.Evil(x)",
+        "",
+        "float[N, 3]",
+        ', "com.example": 1',
+    ),
+    "function": (
+        "it holds functions",
+        "y = Abs(x)",
+        "",
+        "float[N, 3]",
+        "",
+        '<domain: "", opset_import: ["": 20]> Abs (a) => (b) { b = Neg(a) }',
+    ),
+    # Without inputs, so that it would be computed when the file is loaded.
+    "filled": (
+        "ConstantOfShape computes more than 16,777,216 numbers",
+        "big = ConstantOfShape(size) sum = ReduceSum<keepdims = 0>(big) y = Add(x, sum)",
+        "int64[2] size = {1048576, 1048576}",
+    ),
+    "expanded": (
+        "Expand computes more than 16,777,216 numbers",
+        "big = Expand(x, size) y = ReduceMax<keepdims = 0>(big)",
+        "int64[3] size = {1048576, 16384, 3}",
+    ),
+    "large products": (
+        "it computes too much",
+        "a = Expand(one, size) b = MatMul(a, a) c = MatMul(b, b) d = MatMul(c, c)"
+        "e = MatMul(d, d) max = ReduceMax<keepdims = 0>(e) y = Add(x, max)",
+        "float one = {1}, int64[2] size = {4096, 4096}",
+    ),
+    # The process would end.
+    "integer by zero": (
+        "it divides integers",
+        "i = Cast<to = 7>(x) j = Div(i, zero) y = Cast<to = 1>(j)",
+        "int64 zero = {0}",
+    ),
+    "axis": ("LayerNormalization has a wrong axis", "y = LayerNormalization<axis = 2147483648>(x)"),
+    "no input": (
+        "LayerNormalization lacks an input",
+        'y = LayerNormalization(x, w, "")',
+        _zeros(3),
+    ),
+    "outputs": ("Split has a wrong num_outputs", "y, z, w = Split<axis = 1, num_outputs = 1>(x)"),
+    "negative": (
+        "GatherND has a wrong batch_dims",
+        "y = GatherND<batch_dims = -2147483648>(x, i)",
+        "int64[1, 1] i = {0}",
+    ),
+    "negative input": ("the size of x is not positive", "y = Abs(x)", "", "float[-1, 3]"),
+    "text": ("it holds text", "y = Cast<to = 8>(x)"),
+    # Little is computed, but from much, and again and again.
+    "read": (
+        "it computes too much",
+        "big = Expand(x, size)"
+        + "".join(f"v{i} = ReduceLogSumExp(big) " for i in range(100))
+        + f"y = Max({', '.join(f'v{i}' for i in range(100))})",
+        "int64[2] size = {1048576, 3}",
+    ),
+    # A small image and a small result; between them, a matrix of gigabytes.
+    "patches": (
+        "it computes too much",
+        "image = Expand(x, size) y = ConvTranspose<pads = [250, 250, 250, 250]>(image, w)",
+        f"int64[4] size = {{1, 1, 512, 512}}, {_zeros(1, 1, 40, 40)}",
+        "float[N, 1]",
+    ),
+    # Which of the two would be the size?
+    "two of a name": (
+        "a result of Constant has the name of another tensor",
+        "size = Constant<value = int64[1] {1099511627776}>() big = Expand(one, size)"
+        "max = ReduceMax<keepdims = 0>(big) y = Add(x, max)",
+        "int64[1] size = {1}, float one = {1}",
+    ),
+    "size from a value": (
+        "the shape of a result of ConstantOfShape depends on values",
+        "i = Cast<to = 7>(x) size = Squeeze(i, axis) y = ConstantOfShape(size)",
+        "int64[1] axis = {0}",
+    ),
+    "many": (
+        "it has 25,001 operators, not 1 to 10,000",
+        "v0 = Abs(x) " + "".join(f"v{i + 1} = Abs(v{i}) " for i in range(24_999)) + "y = Abs(v9)",
+    ),
+    "incomplete": ("damaged", "y = Gather(w, i)", "float[1000] w = {0}, int64[1] i = {0}"),
+    "inconsistent": ("damaged", "y = MatMul(x, w)", _zeros(4, 4)),
 }
 
 
-@pytest.mark.parametrize("make", HOSTILE, ids=lambda make: make.__name__.strip("_"))
-def test_hostile_networks_are_rejected_before_they_run(make, tmp_path):
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_networks_are_rejected_before_they_run(name, tmp_path):
+    reason, *arguments = HOSTILE[name]
     path = tmp_path / "net.onnx"
-    path.write_bytes(make(tmp_path).SerializeToString())
+    path.write_bytes(_model(*arguments).SerializeToString())
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     start = time.process_time()
-    with pytest.raises(NetworkError, match=rf"net.onnx: .*({HOSTILE[make]})"):
+    with pytest.raises(NetworkError, match=rf"net.onnx: .*({reason})"):
         load_network(path)
     assert time.process_time() - start < 5
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1_000_000  # kB
@@ -501,7 +394,7 @@ def test_huge_file_is_rejected(tmp_path):
 
 def test_further_operator_can_be_allowed_by_name(tmp_path, monkeypatch):
     path = tmp_path / "net.onnx"
-    path.write_bytes(_model([helper.make_node("Cosh", ["x"], ["y"])]).SerializeToString())
+    path.write_bytes(_model("y = Cosh(x)").SerializeToString())
     with pytest.raises(NetworkError, match="the operator Cosh is not allowed"):
         load_network(path)
     monkeypatch.setattr(untrusted, "OPERATORS", untrusted.OPERATORS | {"Cosh"})
