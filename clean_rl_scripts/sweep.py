@@ -10,9 +10,8 @@ A trial's value is the trainer's best validation success.
 
 The folder contains each trial's run, the search itself (`study.log`) and `trials.csv`; `tensorboard
 --logdir FOLDER` shows curves and, under HPARAMS, the comparison. The same command continues an
-interrupted search; trials that were running continue from their checkpoints. An uninterrupted
-search with `--workers 1` is reproducible. Otherwise, samples depend on the order in which trials
-end.
+interrupted search and, from their checkpoints, the trials that were running. With `--workers 1` an
+uninterrupted search is reproducible; otherwise, samples depend on the order in which trials end.
 
 (Paper, appendix "Parameter sweeps": learning rates from 1e-6 to 5e-3; for SAC, with and without
 entropy tuning, `target-entropy=-7,None`, and alpha from 1e-5 to 10.)
@@ -65,17 +64,17 @@ def parse_search(text: str):
     """`NAME=...` -> (name, Optuna distribution). Raises ValueError if it is neither form."""
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
-    match = re.fullmatch(r"-*([^=]+)=(?:(.+)\.\.(.+?)(:log)?|(.+))", text)
-    if match is None:
-        raise ValueError(f"{text!r} is neither NAME=LOW..HIGH nor NAME=a,b,c")
-    name, low, high, log, choices = match.groups()
+    name, _, space = text.lstrip("-").partition("=")
     name = name.replace("_", "-")
-    if choices is not None:
-        return name, CategoricalDistribution(choices.split(","))
+    ends = re.fullmatch(r"(.+)\.\.(.+?)(:log)?", space)
+    if not name or not space:
+        raise ValueError(f"{text!r} is neither NAME=LOW..HIGH nor NAME=a,b,c")
+    if ends is None:
+        return name, CategoricalDistribution(space.split(","))
+    is_whole = all(re.fullmatch(r"-?\d+", end) for end in ends.groups()[:2])
+    number, distribution = (int, IntDistribution) if is_whole else (float, FloatDistribution)
     try:
-        if re.fullmatch(r"-?\d+", low) and re.fullmatch(r"-?\d+", high):
-            return name, IntDistribution(int(low), int(high), log=log is not None)
-        return name, FloatDistribution(float(low), float(high), log=log is not None)
+        return name, distribution(number(ends[1]), number(ends[2]), log=ends[3] is not None)
     except ValueError as error:
         raise ValueError(f"{text!r}: {error}") from error
 
@@ -96,44 +95,55 @@ def train(trainer: Path, flags: list[str], folder: Path) -> float | str:
         # The trainer inherits the lock: this waits for one that has outlived its killed sweep.
         fcntl.flock(log, fcntl.LOCK_EX)
         if not any(folder.glob("*/result.json")):
-            command = [sys.executable, str(trainer)]
-            checkpoints = sorted(folder.glob("*/checkpoint.pt"))
-            begun = ["--resume", str(checkpoints[-1].parent)] if checkpoints else []
-            command += begun or ["--runs-dir", str(folder), *flags]
-            process = subprocess.Popen(command, stdout=log, stderr=log)
+            more = ["--runs-dir", str(folder), *flags]
+            for checkpoint in folder.glob("*/checkpoint.pt"):  # at most one
+                more = ["--resume", str(checkpoint.parent)]
+            process = subprocess.Popen(
+                [sys.executable, str(trainer), *more], stdout=log, stderr=log
+            )
             RUNNING.add(process)
             code = process.wait()
             RUNNING.discard(process)
-            if code < 0 or code in (130, 143):  # Ctrl-C, SIGTERM, or too little memory
-                return "stopped"
-            if code > 0:
-                return "failed"
+            if code:  # Ctrl-C, SIGTERM, and too little memory stop it
+                return "stopped" if code < 0 or code in (130, 143) else "failed"
         result = json.loads(next(folder.glob("*/result.json")).read_text())
         if METRIC not in result:
             log.write(f"its result has no {METRIC}: it trains no policy\n")
-            return "failed"
-        return result[METRIC]
+        return result.get(METRIC, "failed")
 
 
-def sweep(args: Args, search: dict, flags: list[str], workers: int, run: Callable = train):
+def on_ray(address: str) -> tuple[Callable, int]:
+    """`train` on the machines of a Ray cluster, which share the folder, and their number of cores.
+
+    Raises ConnectionError: there is no cluster at the address.
+    """
+    import ray  # pyright: ignore[reportMissingImports]
+
+    options = {"log_to_driver": False, "logging_level": "warning", "ignore_reinit_error": True}
+    ray.init(address=address, **options)
+    remote = ray.remote(num_cpus=1, max_retries=-1)(train)  # machines may be lost
+    cores = max(1, int(ray.cluster_resources().get("CPU", 1)))
+    return lambda *trial: ray.get(remote.remote(*trial)), cores
+
+
+def sweep(args: Args, search: dict, flags: list[str]):
     """Run the search to its end; returns the Optuna study.
 
-    `search` is a dict from a flag to its Optuna distribution, `flags` are those of every trial,
-    `workers` the trials at a time, and `run` is like `train`, on this machine or on another. Raises
-    ValueError: the folder is that of another search.
+    `search` is a dict from a flag to its Optuna distribution, `flags` are those of every trial.
+    Raises ValueError: the folder is that of another search.
     """
     import optuna
     from optuna.storages.journal import JournalFileBackend
     from optuna.trial import TrialState
+    from torch.utils.tensorboard import SummaryWriter
 
+    run, workers = (train, args.workers) if args.ray_address is None else on_ray(args.ray_address)
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     folder = args.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
+    storage = optuna.storages.JournalStorage(JournalFileBackend(str(folder / "study.log")))
     study = optuna.create_study(
-        study_name="sweep",
-        direction="maximize",
-        storage=optuna.storages.JournalStorage(JournalFileBackend(str(folder / "study.log"))),
-        load_if_exists=True,
+        study_name="sweep", direction="maximize", storage=storage, load_if_exists=True
     )
     described = {"trainer": str(args.trainer), "flags": flags, "seed": args.seed}
     described["search"] = {name: str(distribution) for name, distribution in search.items()}
@@ -146,22 +156,21 @@ def sweep(args: Args, search: dict, flags: list[str], workers: int, run: Callabl
     begun = [trial for trial in study.trials if trial.params.keys() == search.keys()]
     unfinished = [trial for trial in begun if trial.state == TrialState.RUNNING]
     lock = threading.Lock()
-    interrupted = threading.Event()
 
     def run_trial():
         with lock:
-            if interrupted.is_set():
-                return
             trial = unfinished.pop(0) if unfinished else study.ask(search)
         path = folder / f"trial_{trial.number:03d}"
         value = run(args.trainer.resolve(), [*flags, *flags_of(trial.params)], path)
         if value == "failed":
             study.tell(trial.number, state=TrialState.FAIL)
         elif value != "stopped":  # then it stays a running one, for the next search
+            with SummaryWriter(path) as writer:
+                writer.add_hparams(trial.params, {f"sweep/{METRIC}": value}, run_name="hparams")
             study.tell(trial.number, value)
             value = f"{value:.3f}"
         with lock:
-            write_report(study, folder)
+            write_table(study, folder)
         print(f"{path.name}: {value} {trial.params}", flush=True)
 
     with ThreadPoolExecutor(workers) as threads:
@@ -171,67 +180,40 @@ def sweep(args: Args, search: dict, flags: list[str], workers: int, run: Callabl
             for job in jobs:
                 job.result()
         except BaseException:
-            interrupted.set()
+            threads.shutdown(wait=False, cancel_futures=True)
             for process in list(RUNNING):
                 process.terminate()  # after a checkpoint
             raise
-    write_report(study, folder)
+    write_table(study, folder)
     return study
 
 
-def write_report(study, folder: Path) -> None:
-    """`trials.csv`, and for TensorBoard the flags and the value of each finished trial."""
+def write_table(study, folder: Path) -> None:
+    """`trials.csv`: a row with the flags and the value of each trial."""
     rows = []
     for trial in study.trials:
         path = folder / f"trial_{trial.number:03d}"
-        state = trial.state.name.lower()
-        row = {"trial": path.name, "state": state, METRIC: trial.value, **trial.params}
-        row["seconds"] = trial.duration.total_seconds() if trial.duration is not None else None
+        row = {"trial": path.name, "state": trial.state.name.lower(), METRIC: trial.value}
+        row |= {**trial.params, "seconds": trial.duration and trial.duration.total_seconds()}
         row["error"] = ""
-        if state == "fail":
+        if row["state"] == "fail":
             row["error"] = (path / "log.txt").read_text(errors="replace").strip().split("\n")[-1]
         rows.append(row)
-        if state == "complete" and not (path / "hparams").exists():
-            from torch.utils.tensorboard import SummaryWriter  # slow to import, and not for --help
-
-            with SummaryWriter(path) as writer:
-                value = {f"sweep/{METRIC}": trial.value}
-                writer.add_hparams(trial.params, value, run_name="hparams")
     with new_contents(folder / "trials.csv") as path, open(path, "w", newline="") as file:
         table = csv.DictWriter(file, rows[0] if rows else [])
         table.writeheader()
         table.writerows(rows)
 
 
-def sweep_on_ray(args: Args, search: dict, flags: list[str]):
-    """`sweep` on an existing Ray cluster, or ConnectionError; its machines share the folder."""
-    import ray  # pyright: ignore[reportMissingImports]
-
-    ray.init(address=args.ray_address, log_to_driver=False, logging_level="warning")
-    try:
-        remote = ray.remote(num_cpus=1, max_retries=-1)(train)  # machines may be lost
-        cores = max(1, int(ray.cluster_resources().get("CPU", 1)))
-        return sweep(args, search, flags, cores, lambda *trial: ray.get(remote.remote(*trial)))
-    finally:
-        ray.shutdown()
-
-
-def _check(args: Args, flags: list[str]) -> dict:
-    """The search space, as for `sweep`. Raises ValueError: an argument is not valid."""
-    check(args)
-    if not args.trainer.is_file():
-        raise ValueError(f"no such trainer: {args.trainer}")
-    search = dict(parse_search(text) for text in args.search)
-    check_folder(args.folder)
-    check_ray(args.ray_address)
-    command = [sys.executable, args.trainer, "--help"]
+def check_flags(trainer: Path, flags: list[str]) -> None:
+    """Raise ValueError unless the trainer has all of these flags."""
+    command = [sys.executable, trainer, "--help"]
     known = re.findall(r"--[\w-]+", subprocess.run(command, capture_output=True, text=True).stdout)
-    for flag in (*(f"--{name}" for name in search), *flags):
+    for flag in flags:
         flag = flag.partition("=")[0].replace("_", "-")
         if flag.startswith("--") and flag not in known:
             hint = suggest(flag, known, "--help lists them")
-            raise ValueError(f"{args.trainer} has no flag {flag}: {hint}")
-    return search
+            raise ValueError(f"{trainer} has no flag {flag}: {hint}")
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -242,11 +224,14 @@ def main(arguments: list[str] | None = None) -> None:
     if importlib.util.find_spec("optuna") is None:
         sys.exit('this needs the extra `sweep`: pip install -c constraints.txt -e ".[sweep]"')
     try:
-        search = _check(args, flags)
-        if args.ray_address is None:
-            study = sweep(args, search, flags, args.workers)
-        else:
-            study = sweep_on_ray(args, search, flags)
+        check(args)
+        if not args.trainer.is_file():
+            raise ValueError(f"no such trainer: {args.trainer}")
+        search = dict(parse_search(text) for text in args.search)
+        check_folder(args.folder)
+        check_ray(args.ray_address)
+        check_flags(args.trainer, [*(f"--{name}" for name in search), *flags])
+        study = sweep(args, search, flags)
     except (ValueError, OSError) as error:
         sys.exit(error_line(error))
     values = [trial.value for trial in study.trials if trial.value is not None]
