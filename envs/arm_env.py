@@ -684,7 +684,7 @@ def _action(action, num_joints):
     if array.shape != (num_joints,):
         raise _no_action(num_joints, f"shape {array.shape}: {action!r}")
     numbers = array.tolist()
-    if not all(map(math.isfinite, numbers)) and not np.isfinite(array).all():  # long doubles
+    if not math.isfinite(sum(numbers)) and not np.isfinite(array).all():  # a sum may overflow
         raise _no_action(num_joints, repr(action))
     return np.array(_clipped(numbers), dtype=np.float64)
 

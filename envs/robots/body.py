@@ -95,6 +95,7 @@ class Body:
         self._commanded = (*robot.joint_indices, *followers)
         self._forces = [*robot.effort.tolist(), *(float(robot.effort[joint]) for joint in leaders)]
         self.gains = [*robot.gains, *(robot.gains[joint] for joint in leaders)]
+        self._has_offset = any(robot.end_effector_offset)
 
     def _widen_limits(self):
         """Widen those limits of joints in PyBullet that would stop one inside the robot's range."""
@@ -109,19 +110,21 @@ class Body:
                     physicsClientId=self.client,
                 )
 
-    def _followers(self, configuration):
-        return [
-            scale * configuration[joint] + offset for _, joint, scale, offset in self.robot.mimics
-        ]
+    def _with_followers(self, configuration):
+        """The configuration as a list, and where the joints are that mimic one of its joints."""
+        positions = list(configuration)
+        for _, joint, scale, offset in self.robot.mimics:
+            positions.append(scale * configuration[joint] + offset)
+        return positions
 
     def set_configuration(self, configuration: np.ndarray | Sequence[float]) -> None:
         """Teleport the arm to joint angles (n, rad), at rest."""
-        angles = [[angle] for angle in configuration]
-        following = [[angle] for angle in self._followers(configuration)]
+        positions = [[position] for position in self._with_followers(configuration)]
+        joints = self.robot.num_joints
         p.resetJointStatesMultiDof(
             self.id,
             self.movable,
-            angles + self._held + following,
+            positions[:joints] + self._held + positions[joints:],
             self._at_rest,
             physicsClientId=self.client,
         )
@@ -132,7 +135,7 @@ class Body:
             self.id,
             self._commanded,
             p.POSITION_CONTROL,
-            targetPositions=[*configuration, *self._followers(configuration)],
+            targetPositions=self._with_followers(configuration),
             forces=self._forces,
             positionGains=self.gains,
             physicsClientId=self.client,
@@ -155,7 +158,7 @@ class Body:
             physicsClientId=self.client,
         )
         position = np.array(link[4])
-        if any(self.robot.end_effector_offset):
+        if self._has_offset:
             position = position + matrix(link[5]) @ np.array(self.robot.end_effector_offset)
         return position, link[5]
 
