@@ -7,12 +7,14 @@ import sys
 
 import meta_device
 import numpy as np
+import onnx
 import pytest
 import torch
 from trainers import GPU
 
 from roboarm_nmp.datasets.demonstrations import load_demos, write_demos
 from roboarm_nmp.evaluation import evaluate
+from roboarm_nmp.networks import export
 
 # As many threads as a trainer has in a process of its own, whatever benchmarks set when they are
 # imported: results are compared bit for bit.
@@ -65,6 +67,46 @@ def seeded():
     random.seed(0)
     np.random.seed(0)
     torch.manual_seed(0)
+
+
+def structure_of(module):
+    """All of a module but its parameters' values, as text."""
+    parts = [(name, tuple(one.shape)) for name, one in module.named_parameters()]
+    parts += [(name, one.numpy().tobytes()) for name, one in module.named_buffers()]
+    for name, part in module.named_modules():
+        code = type(part).forward.__code__
+        public = {key: value for key, value in vars(part).items() if not key.startswith("_")}
+        parts.append((name, code.co_filename, code.co_firstlineno, public))
+    return repr(parts)
+
+
+EXPORTED = {}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def exports_once():
+    """PyTorch takes seconds to export a network, so those that differ in weights alone share one.
+
+    `save_network` compares each with its module. test_networks.py exports all of its own.
+    """
+    export_module = export._export
+
+    def export_once(module, inputs, *options):
+        shapes = [(name, tuple(one.shape), one.dtype) for name, one in inputs.items()]
+        structure = repr((structure_of(module), shapes, *options))
+        if structure not in EXPORTED:
+            EXPORTED[structure] = export_module(module, inputs, *options)
+        model, weights = onnx.ModelProto(), dict(module.named_parameters())
+        model.CopyFrom(EXPORTED[structure])
+        for tensor in model.graph.initializer:
+            if tensor.name in weights:
+                array = weights[tensor.name].numpy()
+                tensor.CopyFrom(onnx.numpy_helper.from_array(array, tensor.name))
+        return model
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(export, "_export", export_once)
+        yield
 
 
 @pytest.fixture(params=["meta", GPU])

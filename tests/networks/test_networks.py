@@ -22,6 +22,11 @@ from roboarm_nmp.networks.network_file import load_network
 from roboarm_nmp.networks.untrusted import NetworkError
 
 
+@pytest.fixture(scope="module", autouse=True)
+def exports_once():
+    """Not here (tests/conftest.py)."""
+
+
 class Actor(nn.Module):
     """An actor with most of what an MLP policy may use."""
 
