@@ -71,10 +71,11 @@ def parse_search(text: str):
         raise ValueError(f"{text!r} is neither NAME=LOW..HIGH nor NAME=a,b,c")
     if ends is None:
         return name, CategoricalDistribution(space.split(","))
-    is_whole = all(re.fullmatch(r"-?\d+", end) for end in ends.groups()[:2])
-    number, distribution = (int, IntDistribution) if is_whole else (float, FloatDistribution)
+    low, high, log = ends[1], ends[2], ends[3] is not None
     try:
-        return name, distribution(number(ends[1]), number(ends[2]), log=ends[3] is not None)
+        if re.fullmatch(r"-?\d+", low) and re.fullmatch(r"-?\d+", high):
+            return name, IntDistribution(int(low), int(high), log=log)
+        return name, FloatDistribution(float(low), float(high), log=log)
     except ValueError as error:
         raise ValueError(f"{text!r}: {error}") from error
 
@@ -164,7 +165,7 @@ def sweep(args: Args, search: dict, flags: list[str]):
         value = run(args.trainer.resolve(), [*flags, *flags_of(trial.params)], path)
         if value == "failed":
             study.tell(trial.number, state=TrialState.FAIL)
-        elif value != "stopped":  # then it stays a running one, for the next search
+        elif not isinstance(value, str):  # one that was stopped is for the next search
             with SummaryWriter(path) as writer:
                 writer.add_hparams(trial.params, {f"sweep/{METRIC}": value}, run_name="hparams")
             study.tell(trial.number, value)
