@@ -17,9 +17,8 @@ from roboarm_nmp.datasets.demonstrations import (
     write_demos,
 )
 from roboarm_nmp.datasets.format import DatasetError
-from roboarm_nmp.datasets.queries import load_queries, write_queries
+from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.envs.subgoals import SUBGOAL_SPACING, subgoals
 from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
@@ -241,18 +240,6 @@ def test_actions_lead_to_the_goal(path, goal_type):
     env.close()
 
 
-def test_following_the_plan_gives_the_digest(path):
-    env = envs.make("wall")
-    for demo in load_demos(path):
-        execution = follow(env, demo.plan)
-        assert execution.reached and not execution.collided
-        assert execution.digest == demo.digest
-        ends = PANDA.normalise(np.stack([demo.start, demo.goal]))
-        assert np.linalg.norm(demo.states[0] - ends[0]) <= QUANTUM * np.sqrt(7)
-        assert np.linalg.norm(demo.states[-1] - ends[1]) <= 0.05
-    env.close()
-
-
 # --- Rejected when writing
 
 
@@ -290,19 +277,6 @@ def test_bad_demonstrations_are_not_written(path, change, complaint):
 # --- Bad files
 
 
-def a_query_file(path):
-    ends = [np.full((2, 7), angle, np.float32) for angle in (-0.05, -0.06)]
-    write_queries(path, "wall", 0, {"test": ends, "validation": ends[::-1]}, "", {})
-
-
-def flip_a_byte_in_the_middle(path):
-    with h5py.File(path) as file:
-        chunk = file["residual"].id.get_chunk_info(0)
-    contents = bytearray(path.read_bytes())
-    contents[chunk.byte_offset + chunk.size // 2] ^= 0xFF
-    path.write_bytes(contents)
-
-
 def sign_again(path):
     """Give a changed file the checksum it should have."""
     with h5py.File(path, "r+") as file:
@@ -319,29 +293,10 @@ def a_row_too_many(path):
     sign_again(path)
 
 
-@pytest.mark.parametrize(
-    ("damage", "complaint"),
-    [
-        (a_query_file, "not a demonstration file (schema 'roboarm-nmp queries'"),
-        (flip_a_byte_in_the_middle, "corrupt"),
-        (a_row_too_many, "the lengths do not add up"),
-    ],
-)
-def test_bad_file_is_rejected_by_name(path, damage, complaint):
-    damage(path)
-    with pytest.raises(DatasetError) as caught:
+def test_lengths_that_do_not_add_up_are_rejected(path):
+    a_row_too_many(path)
+    with pytest.raises(DatasetError, match=f"{path}: .*the lengths do not add up"):
         load_demos(path)
-    assert str(path) in str(caught.value) and complaint in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_file_for_an_old_scene_is_rejected(path, monkeypatch):
-    scene = Scene((Box((0.5, 0.0, 0.3), (0.5, 0.05, 0.61)),))
-    task = dataclasses.replace(envs.TASKS["wall"], scene=scene)
-    monkeypatch.setitem(envs.TASKS, "wall", task)
-    with pytest.raises(DatasetError, match="out of date.*made by a test.*--overwrite") as caught:
-        load_demos(path)
-    assert str(path) in str(caught.value)
 
 
 # --- Files of the project

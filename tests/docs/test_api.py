@@ -1,8 +1,5 @@
 """docs/reference/api.md: its snippets run from top to bottom, and its references exist."""
 
-import importlib
-import re
-
 import numpy as np
 import pytest
 import torch
@@ -34,24 +31,6 @@ def test_snippets_of_the_page_run(page):
     ]
     assert names["filtered"]["safety_filter"]["margin"] == 0.01
     assert len(names["demos"][:10]) == 10
-
-
-def test_every_reference_of_the_page_exists():
-    references = re.findall(r"^::: (\S+)", PAGE, re.M)
-    assert len(references) > 25
-    for name in references:
-        parts = name.split(".")
-        for depth in range(len(parts), 0, -1):
-            try:
-                found = importlib.import_module(".".join(parts[:depth]))
-            except ModuleNotFoundError:
-                continue
-            for part in parts[depth:]:
-                found = getattr(found, part)
-            assert found.__doc__, name
-            break
-    for script in re.findall(r"`(examples/\w+\.py)`", PAGE):
-        assert (ROOT / script).exists(), script
 
 
 def test_stable_baselines3_policy_of_the_page_acts_as_its_model(page, capsys):

@@ -85,14 +85,6 @@ def test_demonstrations_among_moving_obstacles_cannot_have_observations_of_the_s
         oracle.encode_demos(Demos([None]))
 
 
-def test_demonstrations_have_the_latent_code_of_their_scene(env):
-    demos = load_demos(HARD)
-    for i in (0, 7):
-        for transition in demo_transitions(demos[i], env):
-            for name in ("observation", "next_observation"):
-                np.testing.assert_array_equal(transition[name][10:], oracle(demos[i].scene))
-
-
 def test_appended_link_distances_in_observations_buffer_and_demonstrations():
     arguments = {"encoder": "oracle", "append_link_distances": True}
     env = envs.make(HARD, **arguments, link_distances=True, geometry_source="ground_truth")

@@ -41,32 +41,6 @@ def fake_env(max_step, link_distances_at):
 # --- Link distances
 
 
-def test_gradients_agree_with_finite_differences():
-    env = envs.make("random_boxes_hard")
-    env.reset(seed=4)
-    checker, rng = CollisionChecker(env.scene), np.random.default_rng(0)
-    env.close()
-    states, step = rng.uniform(-0.95, 0.95, (200, 7)), 1e-5
-    for self_collisions in (False, True):
-        here = checker.signed_distances(states, self_collisions)
-        for joint in range(7):
-            move = np.zeros(7)
-            move[joint] = step
-            a = checker.signed_distances(states + move, self_collisions)
-            b = checker.signed_distances(states - move, self_collisions)
-            same = (
-                (a.geometry == here.geometry)
-                & (b.geometry == here.geometry)
-                & (here.distance > 0.001)
-            )
-            slope = (a.distance - b.distance) / (2 * step)
-            # (Now and then another point of the same obstacle is the nearest.)
-            assert np.quantile(np.abs(slope - here.gradient[..., joint])[same], 0.99) < 1e-5
-            assert same.mean() > 0.7
-    nothing = CollisionChecker(Scene(table=None, floor=None)).signed_distances(states, False)
-    assert not nothing.gradient.any()
-
-
 @pytest.mark.parametrize(
     ("geometry_source", "goal_type"), [("ground_truth", "ee"), ("point_cloud", "combined")]
 )

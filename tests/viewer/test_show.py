@@ -215,20 +215,3 @@ def test_errors_are_one_line_and_write_nothing(tmp_path, capsys, monkeypatch):
         assert message in output, arguments
         assert output.count("\n") == 1
     assert sorted(os.listdir(tmp_path)) == before
-
-
-def test_full_disk_leaves_the_old_image(tmp_path, capsys, monkeypatch):
-    path = tmp_path / "a.png"
-    path.write_bytes(b"old")
-
-    def fail(descriptor):
-        raise OSError("the disk is full")
-
-    # After a part of the image was written to a temporary file.
-    monkeypatch.setattr(os, "fsync", fail)
-    assert run("wall", "--output", path, *SIZE) == 2
-    assert "the disk is full" in capsys.readouterr().err
-    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a.png"]
-    monkeypatch.undo()
-    assert run("wall", "--output", path, *SIZE) == 0
-    assert path.read_bytes().startswith(b"\x89PNG") and os.listdir(tmp_path) == ["a.png"]

@@ -217,9 +217,6 @@ def test_copies_and_unpickled_encoders_encode_equally(network):
         assert copy.deepcopy(encoder) is pickle.loads(pickle.dumps(encoder)) is encoder
 
 
-# --- PyTorch's defaults
-
-
 # --- Rejected
 
 

@@ -158,20 +158,19 @@ def pybullet_file(name):
     return f"{pybullet_data.getDataPath()}/{name}"
 
 
-def test_gradients_of_link_distances_agree_with_differences(arm):
+@pytest.mark.parametrize("self_collisions", [False, True])
+def test_gradients_of_link_distances_agree_with_differences(arm, self_collisions):
     """Also of a sliding joint, and of one that another joint follows."""
     rng = np.random.default_rng(2)
     checker = CollisionChecker(scene_of(rng, arm))
     states = rng.uniform(-0.9, 0.9, (40, 3))
-    found = checker.signed_distances(states, self_collisions=False)
+    found = checker.signed_distances(states, self_collisions)
     step, agree = 1e-5, []
     for number in range(3):
         ahead, behind = states.copy(), states.copy()
         ahead[:, number] += step
         behind[:, number] -= step
-        ends = [
-            checker.signed_distances(s, self_collisions=False).distance for s in (ahead, behind)
-        ]
+        ends = [checker.signed_distances(s, self_collisions).distance for s in (ahead, behind)]
         slope = (ends[0] - ends[1]) / (2 * step)
         agree.append(np.abs(slope - found.gradient[..., number]) < 1e-3)
     # Elsewhere the nearest obstacle changes between the two ends.

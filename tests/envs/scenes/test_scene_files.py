@@ -1,7 +1,6 @@
 """Scene files: exact round trips, and every mistake is rejected with its line."""
 
 import math
-import os
 import re
 import textwrap
 
@@ -132,23 +131,6 @@ def test_round_trip_is_exact(tmp_path, seed):
     scene = random_scene(seed)
     save_scene(scene, tmp_path / "scene.yaml")
     assert load_scene(tmp_path / "scene.yaml") == scene
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "scene.yaml"
-    save_scene(EXAMPLE, path)
-
-    def full(*_):
-        raise OSError("no space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
-        with pytest.raises(OSError, match="no space"):
-            save_scene(Scene(), path)
-    assert load_scene(path) == EXAMPLE
-    assert os.listdir(tmp_path) == ["scene.yaml"]
-    save_scene(Scene(), path)
-    assert load_scene(path) == Scene()
 
 
 # --- Mistakes
