@@ -105,8 +105,7 @@ def tables(results, unseen):
         ),
         "baselines-path-length": table(head, matrix(results, "path_length", "{:.2f}".format)),
         "baselines-planning-time": table(
-            ["task", *PLANNERS],
-            matrix(results, "planning_seconds", "{:.3f}".format, PLANNERS),
+            ["task", *PLANNERS], matrix(results, "planning_seconds", "{:.3f}".format, PLANNERS)
         ),
     }
 

@@ -18,13 +18,7 @@ from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.robots.rotations import rotation_angle, signed
 from roboarm_nmp.envs.scenes.primitives import Scene, is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
-from roboarm_nmp.envs.world import (
-    HOLD_STEPS,
-    MAX_EDGE,
-    World,
-    image_array,
-    why_no_window,
-)
+from roboarm_nmp.envs.world import HOLD_STEPS, MAX_EDGE, World, image_array, why_no_window
 from roboarm_nmp.utils.bullet import pybullet as p
 
 # rad. Turned by this much, the Panda's hand, 0.21 m from flange to fingertips, is 0.02 m away.
@@ -301,10 +295,7 @@ class RoboArmEnv(gym.Env):
             self.start_configuration = None
 
     def in_collision(
-        self,
-        configuration: np.ndarray | Sequence[float],
-        time: float = 0.0,
-        moving: bool = True,
+        self, configuration: np.ndarray | Sequence[float], time: float = 0.0, moving: bool = True
     ) -> bool:
         """As `World.in_collision`. Continue with a reset."""
         return self.world.in_collision(configuration, time, moving)

@@ -356,10 +356,7 @@ class World:
     # --- Feasibility (paper, appendix: "not in collision, and [...] the simulator can hold")
 
     def in_collision(
-        self,
-        configuration: np.ndarray | Sequence[float],
-        time: float = 0.0,
-        moving: bool = True,
+        self, configuration: np.ndarray | Sequence[float], time: float = 0.0, moving: bool = True
     ) -> bool:
         """Whether the arm at joint angles (n, rad, inside the limits) overlaps the scene or itself.
 

@@ -112,10 +112,7 @@ def test_ctrl_c_while_workers_start_ends_an_evaluation_with_one_line():
 
 @pytest.mark.parametrize(
     ("arguments", "text"),
-    [
-        (["evalute"], "did you mean evaluate?"),
-        (["train", "sca"], "did you mean sac?"),
-    ],
+    [(["evalute"], "did you mean evaluate?"), (["train", "sca"], "did you mean sac?")],
 )
 def test_unknown_subcommand_is_rejected_in_one_line(arguments, text):
     done = run(*arguments)

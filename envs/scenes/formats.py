@@ -602,10 +602,7 @@ def _placed(pose: Pose, outer: Pose | None) -> Pose:
 
 
 def compose_poses(
-    position: Vector,
-    orientation: Quaternion,
-    inner_position: Vector,
-    inner_orientation: Quaternion,
+    position: Vector, orientation: Quaternion, inner_position: Vector, inner_orientation: Quaternion
 ) -> Pose:
     """The pose of an inner pose in an outer one: position, m, and quaternion (xyzw)."""
     moved = np.array(position) + matrix(orientation) @ np.array(inner_position)

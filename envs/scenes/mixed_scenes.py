@@ -17,12 +17,7 @@ FEWEST = 2
 MOST_BOXES = 8
 # m. Walls stand on the table, edge-on to the robot. In two of three scenes the second wall is
 # opposite the first, with the robot in the gap.
-WALL = {
-    "near": (0.14, 0.35),
-    "length": (0.4, 0.8),
-    "thickness": (0.03, 0.06),
-    "height": (0.4, 1.0),
-}
+WALL = {"near": (0.14, 0.35), "length": (0.4, 0.8), "thickness": (0.03, 0.06), "height": (0.4, 1.0)}
 WALLS = 3
 OPPOSITE = 2 / 3
 TURNED = math.radians(15)

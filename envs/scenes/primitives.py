@@ -16,12 +16,7 @@ import numpy as np
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.robots.variants import with_attached, with_held
-from roboarm_nmp.envs.scenes.motions import (
-    Motion,
-    motion_from_numbers,
-    motion_to_numbers,
-    moved,
-)
+from roboarm_nmp.envs.scenes.motions import Motion, motion_from_numbers, motion_to_numbers, moved
 from roboarm_nmp.envs.scenes.numbers import (
     IDENTITY,
     MAX_LENGTH,

@@ -26,12 +26,7 @@ POLES = 0.57  # the rest are walls
 SHELF = {"near": (0.28, 0.42), "depth": (0.15, 0.3), "width": (0.3, 0.5), "thickness": (0.02, 0.04)}
 SHELF_HEIGHT = (0.3, 0.9)
 POLE = {"centre": (0.26, 0.45), "thickness": (0.02, 0.04), "height": (1.2, 1.5)}
-WALL = {
-    "near": (0.26, 0.4),
-    "length": (0.1, 0.25),
-    "thickness": (0.01, 0.03),
-    "height": (1.2, 1.5),
-}
+WALL = {"near": (0.26, 0.4), "length": (0.1, 0.25), "thickness": (0.01, 0.03), "height": (1.2, 1.5)}
 # Obstacles are rough, because the arm slides along smooth ones to its goal.
 FRICTION = 2.45
 # The least distance (m) of obstacles from the robot's axis, below the shoulder's top (m).

@@ -15,12 +15,7 @@ from paths import ROOT
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.__main__ import main as data_command
 from roboarm_nmp.datasets.format import SPLITS, DatasetError
-from roboarm_nmp.datasets.queries import (
-    load_queries,
-    query_path,
-    validate,
-    write_queries,
-)
+from roboarm_nmp.datasets.queries import load_queries, query_path, validate, write_queries
 from roboarm_nmp.demo_generation import make_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.utils.bullet import pybullet as p

@@ -10,12 +10,7 @@ from paths import LIBRARY
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets import format as dataset_format
-from roboarm_nmp.datasets.demonstrations import (
-    QUANTUM,
-    describe,
-    load_demos,
-    write_demos,
-)
+from roboarm_nmp.datasets.demonstrations import QUANTUM, describe, load_demos, write_demos
 from roboarm_nmp.datasets.format import DatasetError
 from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.robots.panda import PANDA

@@ -45,10 +45,7 @@ def test_episode_has_the_observations_of_the_environment():
 
 @pytest.mark.parametrize(
     "arguments, message",
-    [
-        ({"velocities": True}, "have no velocities"),
-        ({"max_step": 0.02}, "steps up to 0.03"),
-    ],
+    [({"velocities": True}, "have no velocities"), ({"max_step": 0.02}, "steps up to 0.03")],
 )
 def test_demonstrations_that_do_not_fit_are_rejected(arguments, message):
     with pytest.raises(DatasetError, match=message):

@@ -9,11 +9,7 @@ from paths import ROOT
 from roboarm_nmp.datasets.__main__ import main
 from roboarm_nmp.datasets.demonstrations import demo_path, describe, load_demos, write_demos
 from roboarm_nmp.datasets.format import DatasetError
-from roboarm_nmp.datasets.queries import (
-    load_queries,
-    query_path,
-    write_queries,
-)
+from roboarm_nmp.datasets.queries import load_queries, query_path, write_queries
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.scenes.files import save_scene
 from roboarm_nmp.envs.scenes.primitives import Box, Scene

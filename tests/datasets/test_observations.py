@@ -96,10 +96,7 @@ def test_files_do_not_depend_on_workers_or_on_earlier_shards(whole, tmp_path, mo
 
 @pytest.mark.parametrize(
     ("change", "complaint"),
-    [
-        ({"task": "three_shelves"}, "for testing only"),
-        ({"num_samples": 10}, "square number"),
-    ],
+    [({"task": "three_shelves"}, "for testing only"), ({"num_samples": 10}, "square number")],
 )
 def test_bad_flag_is_rejected(tmp_path, change, complaint):
     given = args(tmp_path)

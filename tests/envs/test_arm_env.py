@@ -119,10 +119,7 @@ def test_goal_types_rewards_and_termination_on_batches(goal_type, size):
     expected = {
         "ee": PANDA.forward_kinematics(NEAR_HOME),
         "config": PANDA.normalise(NEAR_HOME),
-        "combined": np.r_[
-            PANDA.normalise(NEAR_HOME),
-            PANDA.forward_kinematics(NEAR_HOME),
-        ],
+        "combined": np.r_[PANDA.normalise(NEAR_HOME), PANDA.forward_kinematics(NEAR_HOME)],
     }[goal_type]
     np.testing.assert_allclose(observation["desired_goal"], expected, atol=1e-6)
     assert observation["achieved_goal"].shape == (size,)

@@ -128,11 +128,7 @@ def test_relabelling_without_goal_link_distances_is_right_and_does_not_warn():
     assert "goal_link_distances" not in env.observation_space.spaces
     assert "link_distances" in env.observation_space.spaces
     model = SAC(
-        "MultiInputPolicy",
-        env,
-        replay_buffer_class=HerReplayBuffer,
-        learning_starts=200,
-        seed=0,
+        "MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, learning_starts=200, seed=0
     )
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*goal_link_distances")

@@ -298,8 +298,7 @@ def test_virtual_obstacle_keeps_the_arm_from_a_local_minimum(to_goal, radius):
 
 
 @pytest.mark.parametrize(
-    ("away", "cbf_gain"),
-    [(0.5, CBF_GAIN), (ARRIVAL_DISTANCE / 2, (1 + CBF_GAIN) / 2)],
+    ("away", "cbf_gain"), [(0.5, CBF_GAIN), (ARRIVAL_DISTANCE / 2, (1 + CBF_GAIN) / 2)]
 )
 def test_gain_grows_near_the_goal(away, cbf_gain):
     state = np.array([0.0, 0.0, 0.0, -0.3, 0.0, 0.3, 0.0])

@@ -95,11 +95,7 @@ def flip_a_bit(content):
 
 
 @pytest.mark.parametrize(
-    ("suffix", "damage"),
-    [
-        (".nbc", flip_a_bit),
-        (".nbi", lambda content: b""),
-    ],
+    ("suffix", "damage"), [(".nbc", flip_a_bit), (".nbi", lambda content: b"")]
 )
 def test_damaged_file_is_named_ignored_and_replaced(folder, cache, suffix, damage):
     path = min(cache.rglob(f"*quadruple*{suffix}"))

@@ -245,10 +245,7 @@ def scene_seeds(seed: int) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 def scene_arrays(
-    path: str | Path,
-    scenes: Iterable[Scene] | AnimatedScenes | None,
-    base: Scene,
-    prefix: str = "",
+    path: str | Path, scenes: Iterable[Scene] | AnimatedScenes | None, base: Scene, prefix: str = ""
 ) -> dict[str, np.ndarray]:
     """Arrays for a sequence of `Scene`s, equal ones stored once; none for None."""
     if scenes is None:

@@ -184,10 +184,7 @@ def write_queries(
 
 
 def validate(
-    path: str | Path,
-    task: str | Path | None = None,
-    simulate: bool = False,
-    progress: bool = False,
+    path: str | Path, task: str | Path | None = None, simulate: bool = False, progress: bool = False
 ) -> dict[str, Queries]:
     """Check a query file; returns its splits, a dict of split -> `Queries`.
 

@@ -22,10 +22,7 @@ CLEARANCES = (0.02, 0.01, 0.0)
 
 
 def goal_configuration(
-    robot: Robot,
-    pose: np.ndarray,
-    start: np.ndarray,
-    checker: "CollisionChecker | None" = None,
+    robot: Robot, pose: np.ndarray, start: np.ndarray, checker: "CollisionChecker | None" = None
 ) -> np.ndarray | None:
     """A configuration that has a pose, float32 (n,), rad; None if none was found.
 

@@ -28,12 +28,7 @@ from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.subgoals import SUBGOAL_SPACING
 from roboarm_nmp.policies.policy import Policy
-from roboarm_nmp.policies.safety_filter import (
-    PATIENCE,
-    PROGRESS,
-    PROGRESS_SHARE,
-    ApproachRates,
-)
+from roboarm_nmp.policies.safety_filter import PATIENCE, PROGRESS, PROGRESS_SHARE, ApproachRates
 
 # The numbers below were chosen on fresh queries: docs/lab_notebook.md.
 WATCHED, WATCH_ALL_EVERY = 30, 10  # sub-goals checked in each step; steps between checks of all

@@ -10,13 +10,7 @@ from roboarm_nmp import envs
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 from roboarm_nmp.envs.perception.point_clouds import observed_points
-from roboarm_nmp.envs.perception.sensors import (
-    OBSTACLE,
-    ROBOT,
-    PointCloud,
-    cardinal,
-    observe_scene,
-)
+from roboarm_nmp.envs.perception.sensors import OBSTACLE, ROBOT, PointCloud, cardinal, observe_scene
 from roboarm_nmp.envs.robots.files import load_robot
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 

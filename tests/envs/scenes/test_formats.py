@@ -26,10 +26,7 @@ EXPECTED = {
         MOVEIT_SCENE,
         (Cylinder((0.6, 0.5, 0.07), 0.03, 0.14), SHELF, Sphere((0.5, -0.5, 0.5), 0.05)),
     ),
-    "curobo.yml": (
-        CUROBO,
-        (Box((0.4, 0.0, -0.1), (2.0, 1.5, 0.2)), Sphere((0, 0.6, 0.5), 0.1)),
-    ),
+    "curobo.yml": (CUROBO, (Box((0.4, 0.0, -0.1), (2.0, 1.5, 0.2)), Sphere((0, 0.6, 0.5), 0.1))),
     "new.scene": (SCENE_TEXT, (SHELF, Cylinder((0.5, -0.5, 0.5), 0.03, 0.14, (0, 0, HALF, HALF)))),
     "old.scene": (OLD_SCENE_TEXT, (SHELF, Sphere((0.5, -0.5, 0.5), 0.05))),
 }

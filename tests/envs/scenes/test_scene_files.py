@@ -170,11 +170,7 @@ def sphere(position="[0, 0, 0]", radius="1"):
         ),
         # Whole
         ("\n- floor: 0", 2, "a scene must be a mapping .* obstacles, got a list"),
-        (
-            "floor: 0\nflor: 0",
-            2,
-            "unknown key flor in a scene: known are robot, held, att",
-        ),
+        ("floor: 0\nflor: 0", 2, "unknown key flor in a scene: known are robot, held, att"),
         ("floor: 0\ntable: true\n'floor': 0", 3, "the key 'floor' stands twice"),
         # Floor and table
         ("\nfloor: true", 2, "floor must be a height in metres or false, got true"),

@@ -13,12 +13,7 @@ from roboarm_nmp.datasets.queries import load_queries, write_queries
 from roboarm_nmp.demo_generation import make_queries
 from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.perception.encoders import MAX_OBSTACLES
-from roboarm_nmp.envs.scenes.primitives import (
-    Box,
-    Cylinder,
-    Scene,
-    Sphere,
-)
+from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
 from roboarm_nmp.envs.scenes.random_boxes import GRID, KEEP_CLEAR, SHOULDER
 from roboarm_nmp.envs.tasks import TASKS
 from roboarm_nmp.planning.planner import PlanningError

@@ -72,10 +72,7 @@ def meshes():
     facets = np.zeros(len(triangles), [("numbers", "<f4", 12), ("attribute", "<u2")])
     facets["numbers"][:, 3:] = 0.05 * np.array(corners)[np.array(triangles)].reshape(-1, 9)
     count = np.array([len(triangles)], "<u4").tobytes()
-    return {
-        "box.obj": "\n".join(lines).encode(),
-        "ball.stl": bytes(80) + count + facets.tobytes(),
-    }
+    return {"box.obj": "\n".join(lines).encode(), "ball.stl": bytes(80) + count + facets.tobytes()}
 
 
 def hostile(rng):
