@@ -57,6 +57,31 @@ the name of a task.
 | `--task` |  | the task that the files must be for |
 | `--simulate` | `no` | also check in the simulator that every start and goal is feasible |
 """,
+    "benchmark": """\
+`roboarm benchmark run` runs a method and writes its entry, `roboarm benchmark verify FOLDER ...`
+replays all of it, and `roboarm benchmark table FOLDER` prints the table of verified rows. The page
+[Enter the benchmark](../benchmark/enter.md) explains them.
+
+| flag of `run` | default | meaning |
+|---|---|---|
+| `--policy`, `--function` or `--program` |  | the method |
+| `--output` |  | folder of the entry |
+| `--tasks` | all of the tracks | tasks to run |
+| `--num-queries` | `1000` | test queries of each task |
+| `--quick` | `no` | 50 queries of each task |
+| `--workers` | cores | processes |
+| `--seed` | `0` | of the method's random numbers |
+| `--observes` |  | what the method is given of the scene |
+| `--searches` | `no` | the method searches for paths |
+| `--name`, `--authors`, `--link`, `--licence` |  | what the table says about the method |
+| `--training-data`, `--training-seeds`, `--hardware` |  | likewise |
+| `--developed-on` |  | tasks whose scenes its makers looked at or tuned on |
+
+| flag of `verify` | default | meaning |
+|---|---|---|
+| `--workers` | cores | processes |
+| `--row` |  | write the verified row of the table to this file |
+""",
 }  # commands whose flags are not in a dataclass
 SHARED = {
     "RunArgs": "Flags of the run",

@@ -160,7 +160,7 @@ def _format_scene(scene: Scene) -> str:
     if robot.attached:
         lines.append("attached:")
     for attached in robot.attached:
-        entry = _entry(attached.shape)
+        entry = obstacle_entry(attached.shape)
         [fields] = entry.values()
         fields["link"] = attached.link
         if attached.touch_links:
@@ -169,16 +169,16 @@ def _format_scene(scene: Scene) -> str:
     if scene.table is None or scene.table == TABLE:
         lines.append(f"table: {'false' if scene.table is None else 'true'}")
     else:
-        lines.append(f"table: {_in_one_line(_entry(scene.table)['box'])}")
+        lines.append(f"table: {_in_one_line(obstacle_entry(scene.table)['box'])}")
     lines.append(f"floor: {'false' if scene.floor is None else float(scene.floor)}")
     if scene.friction != FRICTION:
         lines.append(f"friction: {float(scene.friction)}")
     lines.append("obstacles:" if scene.obstacles else "obstacles: []")
-    lines += [f"  - {_in_one_line(_entry(obstacle))[1:-1]}" for obstacle in scene.obstacles]
+    lines += [f"  - {_in_one_line(obstacle_entry(obstacle))[1:-1]}" for obstacle in scene.obstacles]
     return _HEADER + "\n".join(lines) + "\n"
 
 
-def _entry(obstacle: Obstacle) -> dict[str, dict[str, Any]]:
+def obstacle_entry(obstacle: Obstacle) -> dict[str, dict[str, Any]]:
     """An obstacle's kind and fields, as they are in a file; numbers may be NumPy's."""
     kind = "convex_hull" if isinstance(obstacle, ConvexHull) else type(obstacle).__name__.lower()
     fields = vars(obstacle) | {"motion": _motion_fields(obstacle.motion)}

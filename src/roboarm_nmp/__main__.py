@@ -25,6 +25,7 @@ TRAINERS = {
 COMMANDS = {
     "train": (None, "train a policy or a scene encoder: roboarm train --help"),
     "evaluate": ("clean_rl_scripts.evaluate", "evaluate a policy on the queries of a task"),
+    "benchmark": ("evaluation.benchmark", "enter a method into the benchmark, verify an entry"),
     "policies": ("policies", "list the pretrained policies and encoders"),
     "show": ("viewer.show", "image or animation of a task and of a policy"),
     "view": ("viewer.app", "policies in the browser; move goal and obstacles"),

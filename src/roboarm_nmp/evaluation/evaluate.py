@@ -13,11 +13,12 @@ import math
 import platform
 import sys
 import time
+import zlib
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -37,6 +38,7 @@ from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import get_task, task_name
 from roboarm_nmp.evaluation.rollout import REAL_TIME, render_steps, rollout
 from roboarm_nmp.motions.metrics import motion_metrics, path_length, smoothness
+from roboarm_nmp.motions.trajectories import Trajectory
 from roboarm_nmp.policies.baselines import (
     CHECKING,
     OMPL_PLANNERS,
@@ -46,7 +48,7 @@ from roboarm_nmp.policies.baselines import (
     TIME_LIMIT,
     TRIES,
 )
-from roboarm_nmp.policies.policy import BeginEpisode, Policy
+from roboarm_nmp.policies.policy import BeginEpisode, Method, Policy
 from roboarm_nmp.policies.pose_goals import goal_configuration
 from roboarm_nmp.policies.registry import (
     filter_around,
@@ -152,7 +154,7 @@ class EvaluationOptions:
 
 
 def evaluate(
-    policy: str | Path | Policy,
+    policy: str | Path | Policy | Method,
     task: str | Path | None = None,
     *,
     progress: bool = False,
@@ -163,8 +165,8 @@ def evaluate(
     Args:
         policy: `go-to-goal`, `random`, `via-points`, `planner`, `replanning`, `space-time`, the
             path of a policy network or of a folder with a `policy.onnx`, the name of a pretrained
-            policy, or a function from an observation (dict of `RoboArmEnv`) to an action (n,); with
-            several workers, one that can be pickled.
+            policy, a function from an observation (dict of `RoboArmEnv`) to an action (n,), or a
+            `policies.policy.Method`; with several workers, one that can be pickled.
         task: name of the task, or path of a scene file, or `TASK@ROBOT` with a robot's file; None
             for the task that the policy was trained on, and for none with `problems`.
         progress: show a progress bar, with the success rate so far.
@@ -198,8 +200,43 @@ def evaluate(
     return _summary(job, _run(job, progress))
 
 
+class RecordedEpisode(NamedTuple):
+    """An episode as `record` returns it.
+
+    actions: float32 (T, n), exactly as they were executed, rounded to 16 significant bits.
+    success, collision: whether the goal was reached, and whether there was any contact.
+    digest: CRC-32 of the states and contacts, the same for exactly the same motions.
+    seconds: s, of the policy's own computation, planning included.
+    """
+
+    actions: np.ndarray
+    success: bool
+    collision: bool
+    digest: int
+    seconds: float
+
+
+def record(
+    policy: str | Path | Policy | Method,
+    task: str | Path,
+    *,
+    progress: bool = False,
+    **options: Any,
+) -> tuple[dict[str, Any], list[RecordedEpisode]]:
+    """`evaluate`, and the actions of each episode, which were rounded before their execution.
+
+    Arguments and errors as for `evaluate`.
+    """
+    job = replace(_prepare(policy, task, EvaluationOptions(**options)), record=True)
+    outcomes = _run(job, progress)
+    return _summary(job, outcomes), [outcome.pop("episode") for outcome in outcomes]
+
+
 def first_episode_images(
-    policy: str | Path | Policy, task: str | Path | None = None, number: int = 8, **options: Any
+    policy: str | Path | Policy | Method,
+    task: str | Path | None = None,
+    number: int = 8,
+    **options: Any,
 ) -> list[np.ndarray]:
     """`number` images of the first query's episode, uint8 (height, width, 3).
 
@@ -255,13 +292,14 @@ class _Job:
     there are `start`, `goal` and `scenes`. `problems` is as in the result.
     """
 
-    policy: str | Path | Policy
+    policy: str | Path | Policy | Method
     task: str
     options: EvaluationOptions
     start: np.ndarray
     goal: np.ndarray
     scenes: Scenes
     problems: dict[str, str] | None = None
+    record: bool = False
 
     def make(self, render_mode: str | None = None) -> tuple[RoboArmEnv, BeginEpisode]:
         """The environment, and the policy in it as `make_policy` returns it."""
@@ -305,11 +343,11 @@ def _prepare(policy, task, options: EvaluationOptions) -> _Job:
 
 
 def _make_job(
-    policy: str | Path | Policy, task: str | Path | None, options: EvaluationOptions
+    policy: str | Path | Policy | Method, task: str | Path | None, options: EvaluationOptions
 ) -> _Job:
     if task is not None:
         get_task(task)  # to see whether that raises
-    if not callable(policy):
+    if isinstance(policy, (str, Path)):
         policy, trained = find_policy(policy)
         if task is None:
             task = own_task(policy)
@@ -456,20 +494,22 @@ MOTION_METRICS = (
     "min_clearance",
 )
 LENGTHS = ("mean_steps", "path_length", "smoothness", *MOTION_METRICS)
-Outcome = dict[str, float]
+Outcome = dict[str, Any]
 """Of an episode: its success, contact and times, and if it was successful its `LENGTHS`."""
 
 
 class _Counted:
     """A policy, and how many actions it has chosen: not as many as steps where there is a delay."""
 
-    def __init__(self, act: Policy):
+    def __init__(self, act: Policy, rounds: bool):
         self.act = act
+        self.rounds = rounds
         self.actions = 0
 
     def __call__(self, observation: Observation) -> np.ndarray:
         self.actions += 1
-        return self.act(observation)
+        action = self.act(observation)
+        return rounded(action) if self.rounds else action
 
 
 class _Worker:
@@ -496,22 +536,24 @@ class _Worker:
         began = time.perf_counter()
         act, plan_found = self.begin(index, query)
         planning_seconds = time.perf_counter() - began
-        policy = None if act is None else _Counted(act)
+        policy = None if act is None else _Counted(act, self.job.record)
         trajectory = rollout(self.env, query, policy, self.job.delay, planning_seconds)
+        seconds = float(trajectory.times.sum())
         outcome = {
-            "success": trajectory.success,
-            "collision": trajectory.collides,
+            **episode_outcome(trajectory, self._checker(query.scene, len(trajectory))),
             "actions": 0 if policy is None else policy.actions,
-            "policy_seconds": float(trajectory.times.sum()),
+            "policy_seconds": seconds,
             "planning_seconds": planning_seconds,
             "plan_found": bool(plan_found),
         }
-        if trajectory.success:
-            outcome["mean_steps"] = len(trajectory)
-            outcome["path_length"] = path_length(trajectory.configurations)
-            outcome["smoothness"] = smoothness(trajectory.configurations)
-            motion = motion_metrics(trajectory, self._checker(query.scene, len(trajectory)))
-            outcome.update((name, motion[name]) for name in MOTION_METRICS)
+        if self.job.record:
+            outcome["episode"] = RecordedEpisode(
+                trajectory.actions.astype(np.float32),
+                trajectory.success,
+                trajectory.collides,
+                trajectory_digest(trajectory),
+                seconds + planning_seconds,
+            )
         return outcome
 
     def _checker(self, scene, steps):
@@ -524,6 +566,33 @@ class _Worker:
         if scene.is_static:
             return CollisionChecker(scene)
         return [CollisionChecker(scene.at(step * STEP_SECONDS)) for step in range(steps + 1)]
+
+
+def episode_outcome(trajectory: Trajectory, checker: Any = None) -> Outcome:
+    """Success and contact of an episode, and if it was successful its `LENGTHS`.
+
+    `checker` as of `motions.metrics.motion_metrics`: for the clearance, None for none.
+    """
+    outcome: Outcome = {"success": trajectory.success, "collision": trajectory.collides}
+    if trajectory.success:
+        outcome["mean_steps"] = len(trajectory)
+        outcome["path_length"] = path_length(trajectory.configurations)
+        outcome["smoothness"] = smoothness(trajectory.configurations)
+        motion = motion_metrics(trajectory, checker)
+        outcome.update((name, motion[name]) for name in MOTION_METRICS)
+    return outcome
+
+
+def rounded(actions: np.ndarray) -> np.ndarray:
+    """Actions as float32 with 16 significant bits, of which a file needs a quarter less."""
+    bits = np.array(actions, np.float32).view(np.uint32)
+    return ((bits + 0x80) & np.uint32(0xFFFFFF00)).view(np.float32)
+
+
+def trajectory_digest(trajectory: Trajectory) -> int:
+    """CRC-32 of an episode's states and contacts: the same for exactly the same motion."""
+    contacts = np.asarray(trajectory.contacts, bool).tobytes()
+    return zlib.crc32(contacts, zlib.crc32(np.asarray(trajectory.states, np.float32).tobytes()))
 
 
 def _run(job: _Job, progress: bool) -> list[Outcome]:
@@ -565,7 +634,6 @@ def _summary(job: _Job, outcomes: list[Outcome]) -> dict[str, Any]:
     options = job.options
     policy = job.policy
     count = len(outcomes)
-    reached = [outcome for outcome in outcomes if outcome["success"]]
     checks = policy in CHECKING or options.replan
     is_random = checks or policy == "random" or options.safety_filter
     result = {
@@ -578,17 +646,10 @@ def _summary(job: _Job, outcomes: list[Outcome]) -> dict[str, Any]:
     }
     if job.problems:
         result["problems"] = job.problems
-    result["num_queries"] = count
-    for name, hits in (
-        ("success_rate", len(reached)),
-        ("collision_free_success_rate", sum(not outcome["collision"] for outcome in reached)),
-        ("collision_rate", sum(outcome["collision"] for outcome in outcomes)),
-    ):
-        result[name] = hits / count
-        result[f"{name}_interval"] = list(wilson_interval(hits, count))
-    for name in LENGTHS:
-        is_measured = options.measure_clearance or name != "min_clearance"
-        result[name] = _mean(reached, name) if is_measured else None
+    result |= rates_and_means(outcomes)
+    reached = [outcome for outcome in outcomes if outcome["success"]]
+    clearance = _mean(reached, "min_clearance") if options.measure_clearance else None
+    result["min_clearance"] = clearance
     actions = sum(outcome["actions"] for outcome in outcomes)
     seconds = sum(outcome["policy_seconds"] for outcome in outcomes)
     result["ms_per_action"] = 1e3 * seconds / actions if actions else None
@@ -625,6 +686,24 @@ def _summary(job: _Job, outcomes: list[Outcome]) -> dict[str, Any]:
     if options.replan:
         result["replan"] = True
     return result
+
+
+def rates_and_means(outcomes: list[Outcome]) -> dict[str, Any]:
+    """`num_queries`, rates with their intervals, and means over successes, without clearance."""
+    count = len(outcomes)
+    reached = [outcome for outcome in outcomes if outcome["success"]]
+    numbers: dict[str, Any] = {"num_queries": count}
+    for name, hits in (
+        ("success_rate", len(reached)),
+        ("collision_free_success_rate", sum(not outcome["collision"] for outcome in reached)),
+        ("collision_rate", sum(outcome["collision"] for outcome in outcomes)),
+    ):
+        numbers[name] = hits / count
+        numbers[f"{name}_interval"] = list(wilson_interval(hits, count))
+    for name in LENGTHS:
+        if name != "min_clearance":
+            numbers[name] = _mean(reached, name)
+    return numbers
 
 
 def _mean(outcomes, name):

@@ -147,7 +147,7 @@ def _via_points(env: RoboArmEnv, seed: int, tries: int, geometry_source: Geometr
         for via in rng.uniform(-1.0, 1.0, (tries, robot.num_joints)):
             if checker.is_free(via) and checker.is_motion_free([start, via], [via, goal]).all():
                 path = robot.denormalise(np.stack([start, via, goal]))
-                return EpisodePolicy(_follow(path, robot), plan_found=True)
+                return EpisodePolicy(follow_path(path, robot), plan_found=True)
         return EpisodePolicy(_go_to_goal(configuration, robot), plan_found=False)
 
     return begin
@@ -205,7 +205,7 @@ def _planner(env: RoboArmEnv, seed: int, time_limit: float, geometry_source: Geo
             )
         except PlanningError:
             return EpisodePolicy(None, plan_found=False)
-        return EpisodePolicy(_follow(path, env.robot), plan_found=True)
+        return EpisodePolicy(follow_path(path, env.robot), plan_found=True)
 
     return begin
 
@@ -221,12 +221,12 @@ def _space_time(env: RoboArmEnv, seed: int, time_limit: float):
             path = planner.plan(*query, seed=[seed, number], time_limit=time_limit)
         except PlanningError:
             return EpisodePolicy(None, plan_found=False)
-        return EpisodePolicy(_follow(path, env.robot), plan_found=True)
+        return EpisodePolicy(follow_path(path, env.robot), plan_found=True)
 
     return begin
 
 
-def _follow(path: np.ndarray, robot: Robot) -> Policy:
+def follow_path(path: np.ndarray, robot: Robot) -> Policy:
     """One sub-goal per step along a path (k, n), rad; at its end the goal, repeatedly."""
     targets = subgoals(path, robot)[1:]
     remaining = itertools.chain(targets, itertools.repeat(targets[-1]))

@@ -31,7 +31,7 @@ from roboarm_nmp.policies.baselines import (
     make_baseline,
     make_replanning,
 )
-from roboarm_nmp.policies.policy import BeginEpisode, EpisodePolicy, Policy
+from roboarm_nmp.policies.policy import BeginEpisode, EpisodePolicy, Method, Policy
 from roboarm_nmp.policies.pose_goals import ConfigurationGoals
 from roboarm_nmp.utils.names import suggest
 
@@ -101,16 +101,18 @@ def find_policy(name: str | Path) -> tuple[str | Path, dict[str, Any]]:
     return path, _load(path).env_arguments
 
 
-def own_safety_filter(policy: str | Path | Policy) -> "SafetyFilter | None":
+def own_safety_filter(policy: str | Path | Policy | Method) -> "SafetyFilter | None":
     """The `policies.safety_filter.SafetyFilter` that a policy includes; None without one.
 
     `policy` as for `make_policy`. Raises PolicyError: its file cannot be used.
     """
-    return None if callable(policy) or policy in BASELINES else _load(policy).safety_filter
+    if not isinstance(policy, (str, Path)) or policy in BASELINES:
+        return None
+    return _load(policy).safety_filter
 
 
 def filter_around(
-    policy: str | Path | Policy,
+    policy: str | Path | Policy | Method,
     safety_filter: "SafetyFilter | Literal[False] | None",
     replan: bool = False,
 ) -> "SafetyFilter | Literal[False] | None":
@@ -120,12 +122,12 @@ def filter_around(
     return safety_filter
 
 
-def own_task(policy: str | Path | Policy) -> str | None:
+def own_task(policy: str | Path | Policy | Method) -> str | None:
     """The task that a trained policy was trained on, a name or path; None for other policies.
 
     `policy` as for `make_policy`. Raises PolicyError: its file cannot be used.
     """
-    if callable(policy) or policy in BASELINES:
+    if not isinstance(policy, (str, Path)) or policy in BASELINES:
         return None
     task = _load(policy).network.metadata.get("task")
     return task if isinstance(task, str) else None
@@ -173,7 +175,7 @@ def policy_metadata(
 
 
 def make_policy(
-    policy: str | Path | Policy,
+    policy: str | Path | Policy | Method,
     env: RoboArmEnv,
     seed: int = 0,
     tries: int = TRIES,
@@ -191,8 +193,8 @@ def make_policy(
     and policies for configurations then head for a configuration that inverse kinematics finds.
 
     Args:
-        policy: one of `BASELINES`, the path of a policy network, or a function from an observation
-            to an action (n,).
+        policy: one of `BASELINES`, the path of a policy network, a function from an observation to
+            an action (n,), or a `Method`.
         env: the `RoboArmEnv` it will act in.
         seed: of random numbers, >= 0; each query has its own generator.
         tries: random configurations that `via-points` tries per query.
@@ -209,7 +211,9 @@ def make_policy(
         PolicyError: the policy cannot act in this environment.
     """
     as_observed = None
-    if callable(policy):
+    if isinstance(policy, Method):
+        begin = policy.begin(env, seed)
+    elif not isinstance(policy, (str, Path)):
         begin = lambda number, query: EpisodePolicy(policy)  # noqa: E731
     elif policy in BASELINES:
         try:

@@ -1,0 +1,213 @@
+"""The benchmark: enter a method, verify an entry, render the table.
+
+    roboarm benchmark run --policy go-to-goal --quick --output entry
+    roboarm benchmark run --function my_planner:plan --observes point_cloud --output entry
+    roboarm benchmark run --program "./my_planner" --observes ground_truth --output entry
+    roboarm benchmark verify entry
+    roboarm benchmark table benchmarks/leaderboard
+
+docs/benchmark/enter.md explains the rules, the files and what a method is given.
+"""
+
+import argparse
+import os
+import platform
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from roboarm_nmp.envs import TASKS
+from roboarm_nmp.evaluation.entrants import FunctionMethod, ProgramMethod
+from roboarm_nmp.evaluation.evaluate import EvaluationError
+from roboarm_nmp.evaluation.leaderboard import leaderboard
+from roboarm_nmp.evaluation.submissions import (
+    TRACKS,
+    SubmissionError,
+    verify_submission,
+    write_submission,
+)
+from roboarm_nmp.policies.baselines import CHECKING, PLANNERS
+from roboarm_nmp.policies.policy import Method
+from roboarm_nmp.utils.files import write_atomically
+from roboarm_nmp.utils.flags import CORES
+from roboarm_nmp.utils.names import suggest
+from roboarm_nmp.utils.signals import end_with_one_line, error_line
+
+ALL_TASKS = [task for tasks in TRACKS.values() for task in tasks]
+QUICK = 50  # queries of each task
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command. Returns the exit code: 0, or 1 if something is wrong."""
+    options = _parser().parse_args(arguments)
+    try:
+        return {"run": _run, "verify": _verify, "table": _table}[options.command](options)
+    except (ValueError, OSError, RuntimeError) as error:
+        print(error_line(error), file=sys.stderr)
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="roboarm benchmark",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    workers = {"type": int, "default": CORES, "metavar": "N", "help": "processes"}
+
+    run = commands.add_parser("run", help="run a method on the benchmark and write its submission")
+    method = run.add_mutually_exclusive_group(required=True)
+    method.add_argument("--policy", help="a policy's name, a run's folder or a policy.onnx")
+    method.add_argument("--function", metavar="MODULE:FUNCTION", help="a Python function")
+    method.add_argument("--program", metavar="COMMAND", help="a program that speaks JSON lines")
+    run.add_argument("--output", type=Path, required=True, help="folder of the submission")
+    run.add_argument(
+        "--tasks", nargs="+", default=ALL_TASKS, metavar="TASK", help="by default all of the tracks"
+    )
+    run.add_argument("--num-queries", type=int, default=1000, help="test queries of each task")
+    run.add_argument("--quick", action="store_true", help=f"{QUICK} queries of each task")
+    run.add_argument("--workers", **workers)
+    run.add_argument("--seed", type=int, default=0, help="of the method's random numbers")
+    run.add_argument(
+        "--observes",
+        choices=("nothing", "point_cloud", "ground_truth"),
+        help="what --function or --program is given of the scene, or the geometry source of a "
+        "policy; by default nothing, or the policy's own",
+    )
+    run.add_argument("--searches", action="store_true", help="the method searches for paths")
+    about = run.add_argument_group("about the method, for the table")
+    about.add_argument("--name", help="by default that of the policy, function or program")
+    about.add_argument("--authors", default="", help="names")
+    about.add_argument("--link", default="", help="paper or repository")
+    about.add_argument("--training-data", default="none", help="what it has learned from")
+    about.add_argument("--training-seeds", type=int, default=1, help="trainings behind this row")
+    about.add_argument(
+        "--developed-on", nargs="*", default=[], metavar="TASK",
+        help="tasks whose scenes its makers looked at or tuned on",
+    )  # fmt: skip
+    about.add_argument("--hardware", default="", help="by default this machine's processor")
+    about.add_argument("--licence", default="", help="of the method's code")
+
+    verify = commands.add_parser(
+        "verify", help="replay all episodes of submissions and compare with what they claim"
+    )
+    verify.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
+    verify.add_argument("--workers", **workers)
+    verify.add_argument(
+        "--row", type=Path, metavar="FILE", help="write the verified row of the table here (.yaml)"
+    )
+
+    table = commands.add_parser("table", help="print the table of verified rows as Markdown")
+    table.add_argument("folder", type=Path, help="of rows that `verify --row` has written")
+    return parser
+
+
+def _run(options: argparse.Namespace) -> int:
+    for task in options.tasks:
+        if task not in TASKS:
+            raise SubmissionError(f"no such task: {task}: {suggest(task, TASKS)}")
+    policy, arguments, observes, searches, privileged = _method(options)
+    description = {
+        "method": options.name or str(policy),
+        "authors": options.authors,
+        "link": options.link,
+        "observes": observes,
+        "searches": searches,
+        "privileged": privileged,
+        "training_data": options.training_data,
+        "developed_on": options.developed_on,
+        "hardware": options.hardware or _processor(),
+        "licence": options.licence,
+        "training_seeds": options.training_seeds,
+    }
+    document = write_submission(
+        options.output,
+        policy,
+        description,
+        options.tasks,
+        QUICK if options.quick else options.num_queries,
+        progress=True,
+        workers=options.workers,
+        seed=options.seed,
+        **arguments,
+    )
+    for task, numbers in document["tasks"].items():
+        rates = (numbers["success_rate"], numbers["collision_free_success_rate"])
+        print(f"{task:<24} success {rates[0]:.3f}, collision-free {rates[1]:.3f}")
+    print(f"{options.output}: verify it with `roboarm benchmark verify {options.output}`")
+    return 0
+
+
+def _method(options) -> tuple[str | Method, dict[str, Any], str, bool, bool]:
+    """The policy, arguments of `evaluate`, what it observes, whether it searches, privileged."""
+    from roboarm_nmp.evaluation.evaluate import is_privileged
+    from roboarm_nmp.policies.registry import find_policy, own_safety_filter
+
+    if options.policy is None:
+        observes = options.observes or "nothing"
+        if options.function:
+            method = FunctionMethod(options.function, observes)
+        else:
+            method = ProgramMethod(options.program, observes)
+        words = observes.replace("_", " ")
+        return method, {}, words, options.searches, observes == "ground_truth"
+    try:
+        policy, trained = find_policy(options.policy)
+    except ValueError as error:
+        raise EvaluationError(f"--policy: {error}") from error
+    source = options.observes or trained.get("geometry_source")
+    if source is None and (policy in CHECKING or own_safety_filter(policy)):
+        source = "ground_truth"
+    encoder = trained.get("encoder")
+    privileged = is_privileged(trained) or (policy in CHECKING and source == "ground_truth")
+    if privileged:
+        observes = "ground truth"
+    elif "point_cloud" in (source, encoder):
+        observes = "point cloud"
+    else:
+        observes = "latent code" if encoder else "nothing"
+    arguments = {"geometry_source": options.observes} if options.observes else {}
+    searches = options.searches or policy in PLANNERS or policy == "replanning"
+    return options.policy, arguments, observes, searches, privileged
+
+
+def _processor() -> str:
+    """The processor's name, and how many of its cores this process may use."""
+    name = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        name = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    return f"{name}, {len(os.sched_getaffinity(0))} cores"
+
+
+def _verify(options: argparse.Namespace) -> int:
+    code = 0
+    for folder in options.folders:
+        try:
+            row = verify_submission(folder, options.workers, progress=True)
+        except SubmissionError as error:
+            print(error_line(error), file=sys.stderr)
+            code = 1
+            continue
+        count = sum(numbers["num_queries"] for numbers in row["tasks"].values())
+        print(f"{folder}: {row['method']}: {count:,} episodes replayed, all as claimed")
+        if options.row is not None:
+            text = yaml.safe_dump(row, sort_keys=False, allow_unicode=True)
+            write_atomically(options.row, text.encode())
+    return code
+
+
+def _table(options: argparse.Namespace) -> int:
+    print(leaderboard(options.folder))
+    return 0
+
+
+if __name__ == "__main__":
+    end_with_one_line("tasks that are finished are kept; repeat the command to continue")
+    sys.exit(main())

@@ -1,0 +1,417 @@
+"""Submissions to the benchmark: a folder with the actions of each test query, and what they claim.
+
+    write_submission("entry", method, "my planner", tasks=["double_walls"], num_queries=1000)
+    row = verify_submission("entry", workers=2)    # replays every episode, recomputes every number
+
+A submission is `submission.yaml` (who, how, and the claimed numbers) and one HDF5 file per task.
+Because episodes replay bit for bit, nobody has to believe a claim: `verify_submission` executes the
+actions and compares. docs/reference/file_formats.md describes the files.
+"""
+
+import functools
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import yaml
+
+from roboarm_nmp import envs
+from roboarm_nmp.datasets.format import (
+    DatasetError,
+    check_plain,
+    check_schema,
+    get_array,
+    hdf5_bytes,
+    offsets_of,
+    open_hdf5,
+    read_attributes,
+)
+from roboarm_nmp.datasets.queries import Queries, load_queries
+from roboarm_nmp.envs.goals import GOAL_TYPES
+from roboarm_nmp.evaluation.evaluate import (
+    Outcome,
+    RecordedEpisode,
+    episode_outcome,
+    rates_and_means,
+    record,
+    trajectory_digest,
+)
+from roboarm_nmp.evaluation.rollout import Episode
+from roboarm_nmp.policies.policy import Method, Policy
+from roboarm_nmp.utils import workers
+from roboarm_nmp.utils.documents import DocumentError, load_document, plain_data
+from roboarm_nmp.utils.files import write_atomically
+from roboarm_nmp.utils.progress import progress_bar, write_line
+
+TRACKS = {
+    "fixed goals": ("double_walls", "boxes"),
+    "unseen obstacles": ("random_boxes_hard", "three_shelves", "narrow_shelves"),
+    "moving obstacles": ("moving_boxes_medium", "chased_goals"),
+}
+"""The benchmark's tasks."""
+SCHEMA, VERSION = "roboarm-nmp benchmark actions", 1
+DESCRIPTION = {
+    "method": str,
+    "authors": str,
+    "link": str,
+    "observes": str,
+    "searches": bool,
+    "privileged": bool,
+    "training_data": str,
+    "developed_on": list,
+    "hardware": str,
+    "licence": str,
+    "training_seeds": int,
+}
+"""What a submission says about its method, and the types."""
+OBSERVES = ("nothing", "point cloud", "latent code", "ground truth")
+MAX_QUERIES = 10_000
+CHUNK = 10  # queries that a worker verifies at a time
+CLAIMS = (
+    *("success_rate", "collision_free_success_rate", "collision_rate"),
+    *("mean_steps", "path_length", "duration", "mean_jerk"),
+)
+"""Numbers of `roboarm_nmp.evaluate` that a submission claims for each task."""
+ROUNDING = 1e-9  # relative, of means that are computed again
+
+
+class SubmissionError(ValueError):
+    """A submission that cannot be used, or whose claims do not hold."""
+
+
+@dataclass(frozen=True)
+class TaskActions:
+    """The episodes of one task in a submission.
+
+    Attributes:
+        task: its name.
+        goal_type, action_mode: of the environment in which the actions were chosen.
+        queries_digest: of the queries and scenes, as of `queries_digest`.
+        offsets: int64 (m + 1,): the actions of query i are `actions[offsets[i] : offsets[i + 1]]`.
+        actions: float32 (T, n).
+        success, collision: bool (m,).
+        digests: uint32 (m,), of the motions, `RecordedEpisode.digest`.
+        seconds: float32 (m,), s, of the method's own computation.
+    """
+
+    task: str
+    goal_type: str
+    action_mode: str
+    queries_digest: str
+    offsets: np.ndarray
+    actions: np.ndarray
+    success: np.ndarray
+    collision: np.ndarray
+    digests: np.ndarray
+    seconds: np.ndarray
+
+    def __len__(self) -> int:
+        """The number of queries."""
+        return len(self.digests)
+
+    def of_query(self, i: int) -> np.ndarray:
+        """The actions of query i: float32 (t, n)."""
+        return self.actions[self.offsets[i] : self.offsets[i + 1]]
+
+
+def queries_digest(queries: Queries) -> str:
+    """SHA-256 of queries and their scenes, which tells versions of a task apart."""
+    digest = hashlib.sha256(queries.start.tobytes() + queries.goal.tobytes())
+    for i in range(len(queries)):
+        digest.update(repr(queries.scenes[i]).encode())
+    return digest.hexdigest()
+
+
+# --- Writing
+
+
+def write_submission(
+    folder: str | Path,
+    policy: str | Path | Policy | Method,
+    description: dict[str, Any],
+    tasks: Iterable[str],
+    num_queries: int = 1000,
+    progress: bool = False,
+    **options: Any,
+) -> dict[str, Any]:
+    """Run a method on the first test queries of tasks, and write its submission.
+
+    Tasks that are in the folder already are left as they are, so an interrupted run continues.
+
+    Args:
+        folder: is made if there is none.
+        policy, options: as of `roboarm_nmp.evaluate`.
+        description: values of `DESCRIPTION`; `observes` and `privileged` are filled in for policies
+            by name.
+        tasks: names of tasks.
+        num_queries: of each task.
+        progress: show a progress bar.
+
+    Returns:
+        The contents of `submission.yaml`.
+
+    Raises:
+        EvaluationError: as of `evaluate`.
+        SubmissionError: the folder holds another method's submission.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    document = {**description, "tasks": {}}
+    if (folder / "submission.yaml").exists():
+        document = read_description(folder)
+        if document["method"] != description["method"]:
+            raise SubmissionError(f"{folder} holds a submission of {document['method']!r}")
+    for task in tasks:
+        if task in document["tasks"]:
+            write_line(f"{task}: done before")
+            continue
+        write_line(f"{task}: {num_queries:,} queries")
+        result, episodes = record(
+            policy, task, num_queries=num_queries, progress=progress, **options
+        )
+        queries = load_queries(task)[:num_queries]
+        contents = _task_bytes(task, result, queries_digest(queries), episodes)
+        write_atomically(folder / f"{task}.h5", contents)
+        seconds = np.mean([episode.seconds for episode in episodes])
+        document["tasks"][task] = {
+            "num_queries": num_queries,
+            "sha256": hashlib.sha256(contents).hexdigest(),
+            **{name: result[name] for name in CLAIMS},
+            "seconds_per_query": float(f"{seconds:.3g}"),
+        }
+        text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
+        write_atomically(folder / "submission.yaml", text.encode())
+    return document
+
+
+def _task_bytes(
+    task: str, result: dict[str, Any], digest: str, episodes: list[RecordedEpisode]
+) -> bytes:
+    """The contents of a task's file."""
+    attributes: dict[str, str | int] = {
+        "schema": SCHEMA,
+        "schema_version": VERSION,
+        "task": task,
+        "goal_type": result["goal_type"],
+        "action_mode": result["env"].get("action_mode", "relative"),
+        "queries_digest": digest,
+    }
+    packed = {"compression": "gzip", "compression_opts": 9, "shuffle": True}
+    arrays = {
+        "length": np.array([len(episode.actions) for episode in episodes], np.uint16),
+        "actions": np.concatenate([episode.actions for episode in episodes]),
+        "success": np.array([episode.success for episode in episodes], np.uint8),
+        "collision": np.array([episode.collision for episode in episodes], np.uint8),
+        "digests": np.array([episode.digest for episode in episodes], np.uint32),
+        "seconds": np.array([episode.seconds for episode in episodes], np.float32),
+    }
+    return hdf5_bytes(attributes, [(name, array, packed) for name, array in arrays.items()])
+
+
+# --- Reading
+
+
+def read_description(folder: str | Path) -> dict[str, Any]:
+    """The contents of a folder's `submission.yaml`.
+
+    Raises SubmissionError: it is missing, damaged, or an entry is missing or of another type.
+    """
+    path = Path(folder) / "submission.yaml"
+    try:
+        document = plain_data(load_document(path, allow_tags=False))
+    except (DocumentError, OSError) as error:
+        raise SubmissionError(str(error)) from error
+    if not isinstance(document, dict):
+        raise SubmissionError(f"{path}: must be a mapping")
+    for name, kind in DESCRIPTION.items():
+        if type(document.get(name)) is not kind:
+            raise SubmissionError(f"{path}: {name} must be a {kind.__name__}")
+    if document["observes"] not in OBSERVES:
+        raise SubmissionError(f"{path}: observes must be one of {', '.join(OBSERVES)}")
+    tasks = document.get("tasks")
+    if not isinstance(tasks, dict) or not tasks:
+        raise SubmissionError(f"{path}: tasks must be a mapping from tasks to results")
+    for task, claims in tasks.items():
+        if task not in envs.TASKS:
+            raise SubmissionError(f"{path}: no such task: {task}")
+        numbers = [claims.get(name) for name in CLAIMS] if isinstance(claims, dict) else [""]
+        if not all(number is None or type(number) in (int, float) for number in numbers):
+            raise SubmissionError(f"{path}: {task}: must have the numbers {', '.join(CLAIMS)}")
+    return document
+
+
+def read_actions(folder: str | Path, task: str) -> TaskActions:
+    """The episodes of a task.
+
+    Raises SubmissionError: the file is missing, damaged, or holds what cannot be executed.
+    """
+    path = Path(folder) / f"{task}.h5"
+    try:
+        with open_hdf5(path) as file:
+            check_schema(path, file, "a benchmark submission", SCHEMA, VERSION)
+            check_plain(path, file)
+            names = ("task", "goal_type", "action_mode", "queries_digest")
+            attributes = read_attributes(path, file, dict.fromkeys(names, str))
+            length, *others = (
+                _array(path, file, name, dtype)
+                for name, dtype in (
+                    ("length", np.uint16),
+                    ("success", np.uint8),
+                    ("collision", np.uint8),
+                    ("digests", np.uint32),
+                    ("seconds", np.float32),
+                )
+            )
+            joints = envs.get_task(task).base_scene.robot.num_joints
+            offsets = offsets_of(length)
+            actions = _array(path, file, "actions", np.float32, (int(offsets[-1]), joints))
+    except DatasetError as error:
+        raise SubmissionError(str(error)) from error
+    if attributes["task"] != task or attributes["goal_type"] not in GOAL_TYPES:
+        raise SubmissionError(f"{path}: of the task {attributes['task']!r}, or damaged")
+    if any(len(array) != len(length) for array in others) or not len(length):
+        raise SubmissionError(f"{path}: its arrays have different lengths")
+    if not np.isfinite(actions).all():
+        raise SubmissionError(f"{path}: some actions are not finite")
+    success, collision, digests, seconds = others
+    return TaskActions(
+        **attributes,
+        offsets=offsets,
+        actions=actions,
+        success=success.astype(bool),
+        collision=collision.astype(bool),
+        digests=digests,
+        seconds=seconds,
+    )
+
+
+def _array(path, file: h5py.File, name, dtype, shape=None) -> np.ndarray:
+    dataset = get_array(path, file, name)
+    fits = dataset.shape == shape if shape else dataset.ndim == 1 and len(dataset) <= MAX_QUERIES
+    if dataset.dtype != dtype or not fits:
+        raise DatasetError(f"{path}: {name} has shape {dataset.shape} and type {dataset.dtype}")
+    return dataset[:]
+
+
+# --- Verifying
+
+
+def verify_submission(
+    folder: str | Path, num_workers: int = 1, progress: bool = False
+) -> dict[str, Any]:
+    """Replay every episode of a submission, and compare with what it claims.
+
+    Args:
+        folder: of the submission.
+        num_workers: processes.
+        progress: show a progress bar per task.
+
+    Returns:
+        The row for the table: the contents of `submission.yaml`, its numbers computed again, with
+        their intervals.
+
+    Raises:
+        SubmissionError: a file cannot be used; the queries are of another version of the task; an
+            episode ends differently than claimed, and then the message names the first such query;
+            or a claimed number is another.
+    """
+    document = read_description(folder)
+    for task, claims in document["tasks"].items():
+        path = Path(folder) / f"{task}.h5"
+        episodes = read_actions(folder, task)
+        if claims.get("sha256") != hashlib.sha256(path.read_bytes()).hexdigest():
+            write_line(f"{path}: changed since submission.yaml was written")
+        available = load_queries(task)
+        if len(episodes) > len(available):
+            raise SubmissionError(f"{path}: {task} has {len(available)} test queries only")
+        queries = available[: len(episodes)]
+        if episodes.queries_digest != queries_digest(queries):
+            raise SubmissionError(f"{path}: made with other queries or scenes than {task} has here")
+        outcomes = _replay_all(path, episodes, num_workers, progress)
+        numbers = rates_and_means(outcomes)
+        for name in CLAIMS:
+            claim = claims.get(name)
+            if not _agree(claim, numbers[name]):
+                reason = f"{name} is {numbers[name]}, not {claim} as claimed"
+                raise SubmissionError(f"{folder}: {task}: {reason}")
+        intervals = {name: numbers[name] for name in numbers if name.endswith("_interval")}
+        seconds = claims.get("seconds_per_query")
+        document["tasks"][task] = {
+            "num_queries": len(episodes),
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+            "queries_digest": episodes.queries_digest,
+            **{name: numbers[name] for name in CLAIMS},
+            **intervals,
+            "seconds_per_query": seconds if type(seconds) in (int, float) else None,
+        }
+    return document
+
+
+def _agree(claimed: float | None, number: float | None) -> bool:
+    if claimed is None or number is None:
+        return claimed is number
+    return bool(np.isclose(claimed, number, rtol=ROUNDING, atol=0.0))
+
+
+def _replay_all(path, episodes, num_workers, progress) -> list[Outcome]:
+    """The outcomes of all queries, in their order."""
+    count = len(episodes)
+    chunks = [range(first, min(first + CHUNK, count)) for first in range(0, count, CHUNK)]
+    make = functools.partial(_Replayer, path.parent, episodes.task)
+    if num_workers == 1:
+        results = map(make(), chunks)
+    else:
+        results = workers.run(make, (), chunks, min(num_workers, len(chunks)), write_line)
+    outcomes, different = {}, []
+    with progress_bar(total=count, unit="query", disable=not progress) as bar:
+        for indices, chunk in results:
+            for index, (outcome, mistake) in zip(indices, chunk, strict=True):
+                outcomes[index] = outcome
+                if mistake is not None:
+                    different.append((index, mistake))
+            bar.update(len(indices))
+    if different:
+        index, mistake = min(different)
+        others = f", and {len(different) - 1} others differ, too" if len(different) > 1 else ""
+        raise SubmissionError(f"{path}: query {index}: {mistake}{others}")
+    return [outcomes[index] for index in range(count)]
+
+
+class _Replayer:
+    """Replays the episodes of a task, chunk by chunk."""
+
+    def __init__(self, folder: Path, task: str):
+        self.episodes = read_actions(folder, task)
+        self.queries = load_queries(task)
+        self.env = envs.make(
+            task,
+            goal_type=self.episodes.goal_type,
+            action_mode=self.episodes.action_mode,
+        )
+
+    def __call__(self, indices: range) -> tuple[range, list[tuple[Outcome, str | None]]]:
+        """`indices`, and of each query its outcome and what differs from the claim."""
+        return indices, [self._replay(index) for index in indices]
+
+    def _replay(self, index: int) -> tuple[Outcome, str | None]:
+        episodes = self.episodes
+        actions = episodes.of_query(index)
+        mistake = None
+        episode = Episode(self.env, self.queries[index])
+        for number, action in enumerate(actions):
+            if episode.ended:
+                mistake = f"it ends after {number} of {len(actions)} actions"
+                break
+            episode.step(action)
+        trajectory = episode.trajectory()
+        outcome = episode_outcome(trajectory)
+        for name, claims in (("success", episodes.success), ("collision", episodes.collision)):
+            if outcome[name] != claims[index]:
+                mistake = f"{name} is {outcome[name]}, not {bool(claims[index])} as claimed"
+        if mistake is None and trajectory_digest(trajectory) != episodes.digests[index]:
+            mistake = "its motion is another one than was recorded"
+        return outcome, mistake
