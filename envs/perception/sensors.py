@@ -19,7 +19,7 @@ import gymnasium as gym
 import numpy as np
 
 from roboarm_nmp.envs.perception.noise import NO_NOISE, NoiseOfEpisode, SensorNoise
-from roboarm_nmp.envs.perception.ray_casting import NOTHING, OBSTACLE, ROBOT, STATIC, RayCaster  # noqa: F401 (the classes of pixels)
+from roboarm_nmp.envs.perception.ray_casting import NOTHING, OBSTACLE, ROBOT, STATIC, RayCaster  # noqa: F401
 from roboarm_nmp.envs.perception.ray_kernels import AXES, EYE, VIEW, points_of_pixels
 from roboarm_nmp.envs.robots.body import Body
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
