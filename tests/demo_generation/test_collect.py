@@ -284,15 +284,6 @@ def test_existing_file_is_rejected_without_overwrite(output):
     assert output.read_bytes() == b"precious" and list(output.parent.iterdir()) == [output]
 
 
-def test_journal_of_another_collection_is_rejected(journal, output):
-    path = collect.journal_of(output)
-    path.write_bytes(journal)
-    message = rejection(collect.Args(TASK, num=NUM, seed=5, planner="RRT", output=output))
-    assert str(path) in message
-    assert "(seed 0, not 5, planner 'RRTConnect', not 'RRT')" in message
-    assert path.read_bytes() == journal and not output.exists()
-
-
 def test_file_that_is_no_journal_is_left_unchanged(output):
     path, contents = collect.journal_of(output), b"dear diary,\ntoday was fine\n"
     path.write_bytes(contents)

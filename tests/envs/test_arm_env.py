@@ -48,16 +48,6 @@ def test_normalisation_is_the_papers_formula_both_ways():
     np.testing.assert_allclose(PANDA.normalise(M), np.ones(7), atol=1e-12)
 
 
-def test_forward_kinematics_equals_pybullets(env):
-    rng = np.random.default_rng(1)
-    configurations = rng.uniform(PANDA.lower, PANDA.upper, (30, 7))
-    positions = PANDA.forward_kinematics(configurations)
-    for c, position in zip(configurations, positions, strict=True):
-        env.world.arm.set_configuration(c)
-        link = p.getLinkState(env.body, 11, computeForwardKinematics=1, physicsClientId=env.client)
-        np.testing.assert_allclose(position, link[4], atol=1e-6)
-
-
 @pytest.mark.parametrize("mode", ["relative", "subgoal"])
 def test_commanded_displacement_is_clipped_to_max_step(mode, monkeypatch):
     env = envs.make("no_obstacles", action_mode=mode)

@@ -118,16 +118,6 @@ def test_copy_of_a_fresh_environment_resets_the_same():
         np.testing.assert_array_equal(twin.action_space.sample(), env.action_space.sample())
 
 
-def test_copy_of_a_closed_environment_is_closed():
-    env = envs.make("wall")
-    env.reset(seed=0)
-    env.close()
-    twin = make_copy(env)
-    with pytest.raises(RuntimeError, match="is closed"):
-        twin.reset()
-    twin.close()
-
-
 def test_unpickled_environment_in_another_process_has_its_own_world(tmp_path):
     """Not the world that happens to have the same number there."""
     env = envs.make("double_walls")

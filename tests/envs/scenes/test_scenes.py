@@ -320,28 +320,6 @@ def test_an_unsolvable_query_is_rejected_and_counted(monkeypatch):
 # --- MotionBenchMaker's scenes
 
 
-def test_the_bookshelves_are_as_published():
-    """The numbers of the scenes' description, copied by hand: centres and full edges in m."""
-    tall, thin = (TASKS[f"benchmaker_bookshelf_{name}"].scene for name in ("tall", "thin"))
-    for scene in (tall, thin):
-        assert scene.table is None and scene.floor is None
-    boxes = {o.position: o.size for o in tall.obstacles if isinstance(o, Box)}
-    assert boxes == {
-        **{(1.3, 0.0, z): (1.2, 1.0, 0.04) for z in (0.0, 0.3, 0.6, 0.9)},
-        **{(1.3, y, 0.12): (1.3, 0.04, 1.64) for y in (-0.5, 0.5)},
-    }
-    boxes = {o.position: o.size for o in thin.obstacles if isinstance(o, Box)}
-    assert boxes == {
-        **{(0.9, 0.0, z): (0.62, 1.0, 0.04) for z in (-0.35, -0.1, 0.15, 0.4, 0.65, 0.9)},
-        (0.9, 0.0, 0.2): (0.62, 0.04, 1.4),
-        **{(x, y, 0.12): (0.04, 0.04, 1.64) for x in (0.6, 1.2) for y in (-0.5, 0.5)},
-    }
-    for scene, number in ((tall, 9), (thin, 10)):
-        cans = [o for o in scene.obstacles if isinstance(o, Cylinder)]
-        assert len({can.position for can in cans}) == number
-        assert {(can.radius, can.length) for can in cans} == {(0.03, 0.14)}
-
-
 @pytest.mark.parametrize("name", ["tall", "thin"])
 def test_original_starts_and_goals_are_feasible_in_our_world(name):
     task = f"benchmaker_bookshelf_{name}"
