@@ -425,4 +425,4 @@ if __name__ == "__main__":
             run.save()
     scenes.close()
     run.save()  # a longer run, which continues this one, knows its best policy
-    finish(run, test, progress["best"], progress["best_step"])
+    finish(run, test, progress["best"], progress["best_step"], max(args.workers, 1))

@@ -37,7 +37,9 @@ def load_task(args: Any) -> tuple[Queries, Queries]:
     return validation[: args.eval_queries], test[: args.test_queries]  # pyright: ignore
 
 
-def finish(run: Run, test: Queries, best_success: float, best_step: int) -> None:
+def finish(
+    run: Run, test: Queries, best_success: float, best_step: int, num_workers: int = 1
+) -> None:
     """End a run: test `policy.onnx`, write `result.json`, and print a line.
 
     The test is under the task's standard rules, whatever the training's were: 400 steps, contacts
@@ -47,6 +49,7 @@ def finish(run: Run, test: Queries, best_success: float, best_step: int) -> None
         run: the run.
         test: test queries.
         best_success, best_step: of the best evaluation on validation queries.
+        num_workers: processes of the test.
     """
     from roboarm_nmp.evaluation.evaluate import evaluate  # slow to import, and not for --help
 
@@ -55,7 +58,8 @@ def finish(run: Run, test: Queries, best_success: float, best_step: int) -> None
     result: dict[str, Any] = {"task": run.args.task, "goal_type": run.args.goal_type}
     text = "no test, --test-queries 0"
     if len(test):
-        tested = evaluate(policy, run.args.task, queries=test, progress=True)
+        options = {"queries": test, "workers": num_workers}
+        tested = evaluate(policy, run.args.task, progress=True, **options)
         names = (*RESULTS, "num_queries", "robot", "privileged", "deviations")
         result |= {name: tested[name] for name in names}
         text = (
