@@ -2,7 +2,9 @@
 
 import itertools
 import math
+import threading
 
+import numpy as np
 import pytest
 
 from roboarm_nmp.utils import workers
@@ -23,3 +25,16 @@ def test_endless_jobs_end_when_they_are_closed_and_errors_are_raised():
     assert next(results) == 2.0
     with pytest.raises(ValueError):
         next(results)
+
+
+def large(number):
+    return np.zeros(4_000_000)
+
+
+def test_results_that_are_being_sent_do_not_delay_the_end():
+    results = workers.in_order(large, itertools.count(), 2)
+    next(results)
+    ended = threading.Thread(target=results.close, daemon=True)
+    ended.start()
+    ended.join(30)
+    assert not ended.is_alive()

@@ -112,7 +112,9 @@ def in_order(
                 return
             yield running.popleft().result()
     except BaseException:
-        # Without this, `shutdown` would wait for running jobs, and after a death for ever.
+        # Without this, `shutdown` would wait for running jobs, and after a death for ever. Nor is
+        # the rest of a result waited for that a process was sending when it was killed.
+        executor._result_queue._writer.close()
         for process in executor._processes.values():
             process.kill()
         raise
