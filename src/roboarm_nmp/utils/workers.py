@@ -114,7 +114,7 @@ def in_order(
     except BaseException:
         # Without this, `shutdown` would wait for running jobs, and after a death for ever. Nor is
         # the rest of a result waited for that a process was sending when it was killed.
-        executor._result_queue._writer.close()
+        executor._result_queue._writer.close()  # pyright: ignore[reportAttributeAccessIssue]
         for process in executor._processes.values():
             process.kill()
         raise
