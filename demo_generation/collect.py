@@ -57,10 +57,10 @@ class Args:
     """Seed of queries and plans. (The pretrained files have 0, and plans of an earlier version.)"""
     workers: Workers = CORES
     """Number of processes, by default that of the cores. The file does not depend on it."""
-    planner: str = "RRTConnect"
-    """One of OMPL's planners, by name."""
-    max_checks: PositiveInt = 30_000
-    """Collision checks for one plan (about 3 us each)."""
+    planner: str = "compiled"
+    """The compiled planner, or one of OMPL's, by name."""
+    max_checks: PositiveInt = 200_000
+    """Collision checks for one plan (about 0.2 us each)."""
     clearance: NonNegativeFloat = 0.005
     """Metres between plans and the scene, where start and goal allow it."""
     planner_range: NonNegativeFloat = 0.4

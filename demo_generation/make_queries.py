@@ -58,7 +58,7 @@ from roboarm_nmp.utils.signals import end_with_one_line, error_line
 HOLD_STEPS = 24
 STREAMS = {"test": Stream.TEST_QUERIES, "validation": Stream.VALIDATION_QUERIES}
 SCENES = 1  # a fourth number, for the scenes of a split
-SOLVE_ATTEMPTS, SOLVE_CHECKS = 3, 30_000
+SOLVE_ATTEMPTS, SOLVE_CHECKS = 3, 200_000
 # Random configurations for a goal in a region: as many at a time, and at most for one goal.
 GOALS, MAX_GOALS = 1_000, 1_000_000
 

@@ -314,22 +314,9 @@ class RoboArmEnv(gym.Env):
         Raises ValueError, with the name: wrong size, not finite, outside the joint limits or in
         collision.
         """
-        configuration = _vector(name, configuration, (self.robot.num_joints,))
-        self._check_limits(name, configuration)
+        configuration = checked_configuration(self.robot, name, configuration)
         self.world.check_free(**{name: configuration})
         return configuration
-
-    def _check_limits(self, name, configuration):
-        robot = self.robot
-        # float32 may round a limit to just beyond it.
-        outside = np.abs(robot.normalise(configuration)) > 1.0 + 1e-6
-        if outside.any():
-            joint = int(np.argmax(outside))
-            raise ValueError(
-                f"{name} is outside the joint limits: joint {joint + 1} is "
-                f"{configuration[joint]:.4f} rad, limits {robot.lower[joint]} to "
-                f"{robot.upper[joint]}"
-            )
 
     def sample_query(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """A start and a goal that is not reached from the outset: two float32 (n,), rad."""
@@ -457,9 +444,9 @@ class RoboArmEnv(gym.Env):
                 ends = {"goal": vector, "start": start}
             else:
                 end_effector = vector.astype(np.float64)
-        self._check_limits("start", start)
+        _check_limits(self.robot, "start", start)
         if "goal" in ends:
-            self._check_limits("goal", ends["goal"])
+            _check_limits(self.robot, "goal", ends["goal"])
         if scene is not None:
             self.set_scene(scene)
         self.world.check_free(["goal"], **ends)  # from which obstacles may move away
@@ -689,6 +676,28 @@ def _clipped(numbers):
     if max(numbers) <= 1.0 and min(numbers) >= -1.0:
         return numbers
     return [min(max(number, -1.0), 1.0) for number in numbers]
+
+
+def checked_configuration(robot: Robot, name: str, configuration: ArrayLike) -> np.ndarray:
+    """Joint angles as float32 (n,), rad.
+
+    Raises ValueError, with the name: wrong size, not finite, or outside the joint limits.
+    """
+    configuration = _vector(name, configuration, (robot.num_joints,))
+    _check_limits(robot, name, configuration)
+    return configuration
+
+
+def _check_limits(robot, name, configuration):
+    # float32 may round a limit to just beyond it.
+    outside = np.abs(robot.normalise(configuration)) > 1.0 + 1e-6
+    if outside.any():
+        joint = int(np.argmax(outside))
+        raise ValueError(
+            f"{name} is outside the joint limits: joint {joint + 1} is "
+            f"{configuration[joint]:.4f} rad, limits {robot.lower[joint]} to "
+            f"{robot.upper[joint]}"
+        )
 
 
 def _vector(name, value, sizes):

@@ -35,10 +35,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from roboarm_nmp.envs.collision.distance_kernels import link_distances_batch, signed_distances_batch
+from roboarm_nmp.envs.collision.continuous_kernels import clear_batch
+from roboarm_nmp.envs.collision.distance_kernels import (
+    end_distances,
+    link_distances_batch,
+    signed_distances_batch,
+)
+from roboarm_nmp.envs.collision.edge_kernels import motion_batch, single_motion
+from roboarm_nmp.envs.collision.grid_kernels import distance_grid
 from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, group_points, world_shapes
-from roboarm_nmp.envs.collision.motion_kernels import free_batch, motion_batch, single_motion
-from roboarm_nmp.envs.collision.search_kernels import rrt_connect, shortcut
+from roboarm_nmp.envs.collision.motion_kernels import free_batch
+from roboarm_nmp.envs.collision.search_kernels import finish_path, plan_path
+from roboarm_nmp.envs.collision.spheres import block_arm, grid_reach
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes import primitives
@@ -53,6 +61,7 @@ LINK_DISTANCE_RANGE = 0.3
 """m. Observed link distances are clipped to this, and beyond it their gradient is zero."""
 NOTHING, TABLE, FLOOR, ARM, POINT = -1, -2, -3, -4, -5
 """Values of `SignedDistances.geometry` that are not the index of an obstacle."""
+NO_GRID = np.empty(0, np.float32), np.zeros(3, np.int64), np.zeros(5, np.float32)
 EndpointMargins = tuple[ArrayLike, ArrayLike, float]
 """Smaller margins around endpoints: see `CollisionChecker.is_free`."""
 
@@ -79,6 +88,19 @@ class SignedDistances(NamedTuple):
     witness: np.ndarray
     gradient: np.ndarray
     geometry: np.ndarray
+
+
+class Rules(NamedTuple):
+    """What paths keep clear, for `CollisionChecker.search`: r rules, each from some check on.
+
+    begins: int64 (r,): the numbers of checks from which on they hold; the first is 0.
+    numbers: float64 (r, 4): margin and clearance (m), growth of the endpoint margins, resolution.
+    endpoints: float64 (r, k, n + 1): endpoint margins: states, normalised, and distances, m.
+    """
+
+    begins: np.ndarray
+    numbers: np.ndarray
+    endpoints: np.ndarray
 
 
 class CollisionChecker:
@@ -122,6 +144,15 @@ class CollisionChecker:
         self._geometries = np.array([*geometries, ARM, POINT, NOTHING])
         rows, self._arm = world_shapes(shapes, scene.robot)
         self._world = rows, *group_points(points, point_radius)
+
+    @functools.cached_property
+    def _blocks(self):
+        """For checks of motions: the arm's spheres, and a grid around the points."""
+        points = self._world[1]
+        if not len(points):
+            return block_arm(self.robot), NO_GRID
+        radius = float(self._world[3][0, 16])
+        return block_arm(self.robot), distance_grid(points, *grid_reach(self.robot, radius))
 
     @classmethod
     def from_points(
@@ -181,22 +212,39 @@ class CollisionChecker:
         endpoint_margins: EndpointMargins | None = None,
         resolution: float = RESOLUTION,
         ends_known: bool = False,
+        continuous: bool = False,
     ) -> np.ndarray:
         """Whether straight motions are free: bool (...).
 
-        The ends are checked first, then points between them that are at most `resolution` apart:
-        the middle, then the middle of each half, and so on, until one is not free.
+        Their ends are checked, and points between them that are at most `resolution` apart. With
+        `continuous`, nothing is touched between these points either: what comes nearer than the
+        margin and 2 um anywhere is not free.
 
         Args:
             starts, ends: (..., n), normalised; one may be broadcast to the other.
             margin, clearance, endpoint_margins: as for `is_free`.
             resolution: L2, normalised, > 0.
             ends_known: both ends are known to be free, and are not checked.
+            continuous: check the whole motions. `resolution` and `ends_known` then don't matter.
         """
+        if continuous:
+            return self._are_motions_clear(starts, ends, margin, clearance, endpoint_margins)
         checks = self.motion_checks(
             starts, ends, margin, clearance, endpoint_margins, resolution, ends_known
         )
         return checks >= 0
+
+    def _are_motions_clear(self, starts, ends, margin, clearance, endpoint_margins):
+        starts, ends = np.broadcast_arrays(
+            self._states("starts", starts), self._states("ends", ends)
+        )
+        batch = starts.shape[:-1]
+        rule, endpoints = self._rule(margin, clearance, endpoint_margins, batch=batch)
+        clear = np.empty(batch, dtype=np.bool_)
+        starts = np.ascontiguousarray(starts.reshape(-1, self.robot.num_joints))
+        ends = np.ascontiguousarray(ends.reshape(-1, self.robot.num_joints))
+        clear_batch(starts, ends, rule, endpoints, self._arm, self._world, clear.reshape(-1))
+        return clear
 
     def motion_checks(
         self,
@@ -221,8 +269,10 @@ class CollisionChecker:
             rule,
             endpoints,
             self._arm,
+            self._blocks[0],
             self._world,
-            ends_known,
+            self._blocks[1],
+            bool(ends_known),
             checks.reshape(-1),
         )
         return checks
@@ -239,7 +289,10 @@ class CollisionChecker:
         The function assumes that the start is free, and does not validate its arguments.
         """
         rule, endpoints = self._rule(margin, clearance, endpoint_margins, resolution)
-        return functools.partial(single_motion, rule, endpoints[0], *self._arm, *self._world)
+        arm32, grid = self._blocks
+        return functools.partial(
+            single_motion, rule, endpoints[0], *self._arm, arm32, *self._world, grid
+        )
 
     def find_path(
         self,
@@ -273,14 +326,74 @@ class CollisionChecker:
         start = self._states("start", start)
         goals = np.atleast_2d(self._states("goals", goals))
         rule, endpoints = self._rule(margin, clearance, endpoint_margins)
-        rule = rule, endpoints[0], self._arm, self._world
-        # Most samples take more than one check: there are as many as can be needed.
-        samples = rng.uniform(-1.0, 1.0, (max_checks, len(start)))
-        path, checks = rrt_connect(start, goals, samples, reach, max_checks, *rule)
-        if not len(path):
-            return None, checks
-        path, more = shortcut(path, rng.uniform(size=(chords, 2)), *rule)
-        return path, checks + more
+        path, checks = self.search(
+            start,
+            goals,
+            Rules(np.zeros(1, np.int64), rule[None], endpoints),
+            int(rng.integers(2**63)),
+            reach=reach,
+            max_checks=max_checks,
+            chords=chords,
+        )
+        return path, checks
+
+    def search(
+        self,
+        start: np.ndarray,
+        goals: np.ndarray,
+        rules: Rules,
+        seed: int,
+        *,
+        bounds: np.ndarray | None = None,
+        reach: float = REACH,
+        checks: int = 0,
+        max_checks: float = math.inf,
+        chords: int = 40,
+    ) -> tuple[np.ndarray | None, int]:
+        """`find_path` for planners, with rules that change during the search.
+
+        Args:
+            start, goals: float64 (n,) and (m, n), normalised; they are not checked.
+            rules: `Rules`.
+            bounds: (2, n), between which random states are; by default -1 and 1.
+            checks: how many there were before.
+            max_checks: about the number of checks at which the search ends.
+            reach, chords: as for `find_path`.
+        """
+        if bounds is None:
+            bounds = np.array([[-1.0], [1.0]]) * np.ones(len(start))
+        arm32, grid = self._blocks
+        problem = tuple(rules), self._arm, arm32, self._world, grid
+        path, checks = plan_path(
+            np.ascontiguousarray(start),
+            np.ascontiguousarray(goals),
+            np.uint64(seed % 2**64),
+            bounds,
+            float(reach),
+            chords,
+            checks,
+            int(min(max_checks, 2**62)),
+            problem,
+        )
+        return (path if len(path) else None), checks
+
+    def finish_path(self, path: np.ndarray, rules: Rules, seed: int, chords: int):
+        """A path (k, n) of another planner, shortened, and the number of checks.
+
+        Nothing touches anywhere on it; None where the path touches something between its states.
+        """
+        arm32, grid = self._blocks
+        problem = tuple(rules), self._arm, arm32, self._world, grid
+        path, checks = finish_path(path, np.uint64(seed % 2**64), chords, problem)
+        return (path if len(path) else None), checks
+
+    def end_distances(self, states: np.ndarray, within: float) -> np.ndarray:
+        """Distances (m) of states (m, n) from everything, and from the scene: (2, m).
+
+        Infinite where nothing is `within` (m).
+        """
+        links = len(self.robot.collision_links)
+        return end_distances(states, float(within), links, self._arm, self._world)
 
     def signed_distances(
         self, states: ArrayLike, self_collisions: bool = True, within: float = math.inf

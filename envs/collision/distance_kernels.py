@@ -20,6 +20,7 @@ from roboarm_nmp.envs.collision.arm_kernels import (
     place_arm,
     working_memory,
 )
+from roboarm_nmp.envs.collision.block_kernels import F32, row_gaps, rows_of_block
 from roboarm_nmp.envs.collision.gjk_kernels import (
     GJK_TOLERANCE,
     begin_gjk,
@@ -37,6 +38,7 @@ from roboarm_nmp.envs.collision.gjk_kernels import (
 )
 from roboarm_nmp.utils.numba_cache import compiled
 
+_NEAR_SLACK = 1e-5  # m: more than rounding the arm to float32 changes
 _EPA_TOLERANCE, _EPA_VERTICES, _EPA_FACES = 1e-7, 128, 768
 
 
@@ -322,6 +324,9 @@ def signed_distances_batch(
     )
     gaps = np.empty(groups.shape[0]), np.empty(points.shape[0])
     of_arm, touching = rows.shape[0], rows.shape[1] > ROW
+    columns = rows_of_block(rows)[1]
+    capacity = columns.shape[0] // ROW
+    near = np.empty(capacity, np.float32)
     distance[:], normal[:], witness[:], geometry[:] = within, 0.0, 0.0, of_arm + 2
     for i in range(states.shape[0]):
         place_arm(states[i], chain, bodies, frames, centres)
@@ -330,15 +335,20 @@ def signed_distances_batch(
             if link < 0:  # the base
                 continue
             # The shape that is probably nearest comes first: it rules out the others.
-            first, least = 0, FAR
-            for j in range(rows.shape[0]):
-                squared = sphere_gap(rows, j, centres, k)
-                if squared < least:
-                    first, least = j, squared
+            x, y, z = F32(centres[k, 0]), F32(centres[k, 1]), F32(centres[k, 2])
+            row_gaps(columns, capacity, x, y, z, near)
+            first = 0
+            for j in range(1, rows.shape[0]):
+                if near[j] < near[first]:
+                    first = j
             for n in range(rows.shape[0]):
                 j = first if n == 0 else n - 1 if n <= first else n
                 rounding = rows[j, 16] + bodies[k, ROUNDING]
                 far = min(distance[i, link] + rounding, FAR)
+                # (What is farther than `near` says, which is rounded, is so by the slack.)
+                reach = bodies[k, RADIUS] + far + columns[17 * capacity + j] + _NEAR_SLACK
+                if near[j] >= reach * reach and reach > 0.0:
+                    continue
                 core = _signed_distance(
                     bodies, vertices, cells, k, rows, j, frames, centres, pose, s, far, polytope
                 )
@@ -405,3 +415,24 @@ def link_distances_batch(states, rows, self_collisions, within, arm, world):
             for j in range(states.shape[1]):
                 rows[i, link, 1 + j] = gradient[i, link, j]
     return True
+
+
+@compiled
+def end_distances(states, within, links, arm, world):
+    """Distances (m) of states (m, n) from everything, and from the scene: (2, m).
+
+    Infinite beyond `within`. `links`: those that may collide.
+    """
+    m, n = states.shape
+    distance, geometry = np.empty((m, links)), np.empty((m, links), np.int64)
+    normal, witness = np.empty((m, links, 3)), np.empty((m, links, 3))
+    gradient = np.empty((m, links, n))
+    least = np.full((2, m), np.inf)
+    for k in range(2):
+        signed_distances_batch(
+            states, k == 0, within, arm, world, distance, normal, witness, gradient, geometry
+        )
+        for i in range(m):
+            for link in range(links):
+                least[k, i] = min(least[k, i], distance[i, link])
+    return least

@@ -5,6 +5,8 @@ What the arguments hold: `arm_kernels`.
 
 import math
 
+import numpy as np
+
 from roboarm_nmp.envs.collision.arm_kernels import (
     BOX,
     CORNERS,
@@ -17,6 +19,7 @@ from roboarm_nmp.envs.collision.arm_kernels import (
     ROW,
     SHARP,
     SIMPLEX,
+    SPHERE,
 )
 from roboarm_nmp.utils.numba_cache import compiled, uncounted
 
@@ -34,6 +37,34 @@ GJK_TOLERANCE, _MAX_ITERATIONS = 1e-8, 64
 ROUNDING_ERROR = 1e-9
 # Bullet makes two boxes overlap by this share of their half edges where two edges meet.
 _EDGE_FUDGE = 1e-5
+
+
+@compiled
+def rows_of_primitives(numbers):
+    """`hulls.shape_rows` of obstacles as `primitives.to_array`; of hulls, only their poses."""
+    rows = np.zeros((numbers.shape[0], ROW))
+    half = np.empty(3)
+    for i in range(numbers.shape[0]):
+        kind = numbers[i, 0]
+        x, y, z, w = numbers[i, 4], numbers[i, 5], numbers[i, 6], numbers[i, 7]
+        norm = math.sqrt(x * x + y * y + z * z + w * w)
+        x, y, z, w = x / norm, y / norm, z / norm, w / norm
+        for j in range(3):
+            half[j] = numbers[i, 8 + j] if kind == SPHERE else numbers[i, 8 + j] / 2.0
+        if kind == CYLINDER:
+            half[0] = half[1] = numbers[i, 8]
+        rounding = half[0] if kind == SPHERE else min(BULLET_MARGIN, half[0], half[1], half[2])
+        row = rows[i]
+        row[0], row[16] = kind, rounding
+        row[4], row[5] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w)
+        row[6], row[7] = 2.0 * (x * z + y * w), 2.0 * (x * y + z * w)
+        row[8], row[9] = 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)
+        row[10], row[11] = 2.0 * (x * z - y * w), 2.0 * (y * z + x * w)
+        row[12] = 1.0 - 2.0 * (x * x + y * y)
+        for j in range(3):
+            row[1 + j] = numbers[i, 1 + j]
+            row[13 + j] = half[j] - rounding
+    return rows
 
 
 @uncounted
@@ -415,52 +446,60 @@ def _boxes_separated(bodies, vertices, k, rows, j, pose, s, gap):
 
 
 @uncounted
-def _boxes_apart_by(bodies, vertices, cells, k, rows, j, pose, s, gap):
-    """`apart_by` of two boxes. `gap` includes their rounding, which they do not have here."""
-    rounding = bodies[k, ROUNDING] + rows[j, 16]
-    margin = gap - rounding
+def _are_boxes_apart(bodies, vertices, cells, k, rows, j, pose, s, gap):
+    """`is_apart` of two boxes. `gap` includes their rounding, which they do not have here."""
+    margin = gap - (bodies[k, ROUNDING] + rows[j, 16])
     if abs(margin) < ROUNDING_ERROR:
         margin = 0.0
     if not _boxes_separated(bodies, vertices, k, rows, j, pose, s, min(margin, 0.0)):
-        return -FAR
-    if margin > 0.0:
-        sharp = s[None, SIMPLEX:]
-        write_sharp_row(bodies, rows, j, sharp)
-        begin_gjk(sharp, 0, pose, s)
-        body = int(bodies[k, SHARP])
-        if gjk(vertices, cells, body, sharp, 0, pose, s, margin, margin)[0] < margin:
-            return -FAR
-        return max(s[31] + rounding, gap)
-    return gap
+        return False
+    if margin <= 0.0:
+        return True
+    sharp = s[None, SIMPLEX:]
+    write_sharp_row(bodies, rows, j, sharp)
+    begin_gjk(sharp, 0, pose, s)
+    return (
+        gjk(vertices, cells, int(bodies[k, SHARP]), sharp, 0, pose, s, margin, margin)[0] >= margin
+    )
 
 
 @uncounted
-def apart_by(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap, axes, n):
-    """`_is_apart`, with a lower bound (m) of the distance, at least `gap`; -`FAR` if it is nearer.
+def is_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap):
+    """Whether a body's hull is at least `gap` (m) from a shape's core."""
+    relative_pose(rows, j, frames, int(bodies[k, FRAME]), centres, k, pose)
+    if both_boxes(bodies, k, rows, j):
+        return _are_boxes_apart(bodies, vertices, cells, k, rows, j, pose, s, gap)
+    if boxes_apart(bodies, k, rows, j, pose, gap):
+        return True
+    begin_gjk(rows, j, pose, s)
+    return gjk(vertices, cells, k, rows, j, pose, s, gap, gap)[0] >= gap
+
+
+@uncounted
+def was_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap, axes, n):
+    """`is_apart` for many similar states of the arm, which is faster.
 
     Row n of `axes` (m, 3) is the axis from the core to the body, in the base's frame, along which
-    the two were apart before; zeros at first. It is tried first, and written here. No axis is tried
-    where `axes` is empty.
+    the two were apart before; zeros at first. It is tried first, and written here.
     """
     f = int(bodies[k, FRAME])
     relative_pose(rows, j, frames, f, centres, k, pose)
     if both_boxes(bodies, k, rows, j):
-        return _boxes_apart_by(bodies, vertices, cells, k, rows, j, pose, s, gap)
-    if axes.shape[0] > 0 and (axes[n, 0] != 0.0 or axes[n, 1] != 0.0 or axes[n, 2] != 0.0):
+        return _are_boxes_apart(bodies, vertices, cells, k, rows, j, pose, s, gap)
+    if axes[n, 0] != 0.0 or axes[n, 1] != 0.0 or axes[n, 2] != 0.0:
         x = frames[f, 0] * axes[n, 0] + frames[f, 3] * axes[n, 1] + frames[f, 6] * axes[n, 2]
         y = frames[f, 1] * axes[n, 0] + frames[f, 4] * axes[n, 1] + frames[f, 7] * axes[n, 2]
         z = frames[f, 2] * axes[n, 0] + frames[f, 5] * axes[n, 1] + frames[f, 8] * axes[n, 2]
         px, py, pz, _, _, _ = support(vertices, cells, k, rows, j, pose, -x, -y, -z)
         lower = (px * x + py * y + pz * z) / math.sqrt(x * x + y * y + z * z)
         if lower >= gap + ROUNDING_ERROR:
-            return lower
+            return True
     if boxes_apart(bodies, k, rows, j, pose, gap):
-        return gap
+        return True
     begin_gjk(rows, j, pose, s)
     if gjk(vertices, cells, k, rows, j, pose, s, gap, gap)[0] < gap:
-        return -FAR
-    if axes.shape[0] > 0:
-        for i in range(3):
-            x, y, z = frames[f, 3 * i], frames[f, 3 * i + 1], frames[f, 3 * i + 2]
-            axes[n, i] = x * s[28] + y * s[29] + z * s[30]
-    return max(s[31], gap)
+        return False
+    for i in range(3):
+        x, y, z = frames[f, 3 * i], frames[f, 3 * i + 1], frames[f, 3 * i + 2]
+        axes[n, i] = x * s[28] + y * s[29] + z * s[30]
+    return True

@@ -31,11 +31,11 @@ from roboarm_nmp.envs.collision.arm_kernels import (
     SPAN,
     SPHERE,
 )
-from roboarm_nmp.envs.collision.gjk_kernels import BULLET_MARGIN, CELLS
+from roboarm_nmp.envs.collision.gjk_kernels import BULLET_MARGIN, CELLS, rows_of_primitives
 from roboarm_nmp.envs.robots.body import body_alone, collision_elements
 from roboarm_nmp.envs.robots.robot import Link, Robot
 from roboarm_nmp.envs.robots.rotations import matrix
-from roboarm_nmp.envs.scenes.primitives import ConvexHull, Cylinder, Sphere, to_array
+from roboarm_nmp.envs.scenes.primitives import ConvexHull, to_array
 from roboarm_nmp.utils.bullet import load_urdf
 from roboarm_nmp.utils.bullet import pybullet as p
 from roboarm_nmp.utils.files import temporary_file
@@ -76,7 +76,7 @@ def arm_hulls(robot: Robot) -> tuple[np.ndarray, ...]:
         row[ROTATION:] = _exact(frame.rotation)
     bodies, meshes, boxes = [], [], []
     of_link = {link.index: [] for link in robot.links}
-    for link, mesh, rounding, surface in link_shapes(robot):
+    for link, mesh, rounding, surface in _kept_shapes(robot):
         centre = (mesh.min(0) + mesh.max(0)) / 2
         mesh = mesh - centre
         body = np.empty(BODY_COLUMNS)
@@ -104,6 +104,16 @@ def arm_hulls(robot: Robot) -> tuple[np.ndarray, ...]:
     bodies = np.reshape(bodies, (-1, BODY_COLUMNS))
     bodies = np.concatenate([bodies, _levers(chain, bodies)], axis=1)
     return chain, bodies, pairs, np.concatenate(meshes), _cells(meshes)
+
+
+@functools.lru_cache(64)
+def _kept_shapes(robot):
+    return tuple(link_shapes(robot))
+
+
+def vertex_counts(robot: Robot) -> list[int]:
+    """How many of the `vertices` of `arm_hulls` each body has, from the first one on."""
+    return [len(mesh) for _, mesh, _, _ in _kept_shapes(robot)]
 
 
 def _levers(chain, bodies):
@@ -337,24 +347,13 @@ def _concat_cells(cells, others, num_vertices):
 
 def shape_rows(obstacles: Sequence) -> np.ndarray:
     """Obstacles -> float64 (n, `ROW`); `world_shapes` adds the bodies of convex hulls."""
-    rows = np.zeros((len(obstacles), ROW))
-    for obstacle, numbers, row in zip(obstacles, to_array(obstacles), rows, strict=True):
-        quaternion = numbers[4:8]
-        # Python's floats: NumPy's are ten times as slow one by one, and scenes that move have a
-        # checker per step.
-        x, y, z, w = (quaternion / math.sqrt(quaternion @ quaternion)).tolist()
-        kind, *position = numbers[:4].tolist()
-        half = [size if isinstance(obstacle, Sphere) else size / 2 for size in numbers[8:].tolist()]
-        if isinstance(obstacle, Cylinder):
-            half[:2] = obstacle.radius, obstacle.radius
-        rounding = half[0] if isinstance(obstacle, Sphere) else min(BULLET_MARGIN, *half)
-        rotation = matrix((x, y, z, w))
+    rows = rows_of_primitives(to_array(obstacles))
+    for obstacle, row in zip(obstacles, rows, strict=True):
         if isinstance(obstacle, ConvexHull):
             centre, mesh, _ = _hull(obstacle.vertices)
-            kind, rounding, half = LINK, BULLET_MARGIN, (mesh.max(0) + BULLET_MARGIN).tolist()
-            position = position + rotation @ centre
-        row[0], row[1:4], row[4:13], row[16] = kind, position, rotation.ravel(), rounding
-        row[13:16] = [edge - rounding for edge in half]
+            row[0], row[16] = LINK, BULLET_MARGIN
+            row[1:4] += row[4:13].reshape(3, 3) @ centre
+            row[13:16] = mesh.max(0)
     return rows
 
 
@@ -376,6 +375,8 @@ def group_points(points, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndar
         index after its last. `ball`: float64 (1, `ROW`), a point as a shape.
     """
     points = np.asarray(points, dtype=np.float64)
+    if not points.size and radius == 0.0:
+        return _NO_POINTS
     if not points.size:
         points = points.reshape(0, 3)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -398,3 +399,7 @@ def group_points(points, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndar
     ball = np.zeros((1, ROW))
     ball[0, 0], ball[0, 16] = SPHERE, radius
     return points, groups, ball
+
+
+_NO_POINTS = np.empty((0, 3)), np.empty((0, 6)), np.zeros((1, ROW))
+_NO_POINTS[2][0, 0] = SPHERE

@@ -1,82 +1,131 @@
-"""Compiled planning within a number of checks: RRT-Connect and shortcuts."""
+"""Compiled planning: RRT-Connect (Kuffner and LaValle, 2000) with restarts.
+
+What stays the same during a search is a `problem`: `(rules, arm, arm32, world, grid)`. The rules
+are those of `checker.Rules`.
+"""
 
 import math
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.arm_kernels import FAR
-from roboarm_nmp.envs.collision.motion_kernels import motion
-from roboarm_nmp.utils.numba_cache import compiled
+from roboarm_nmp.envs.collision.continuous_kernels import continuous_memory
+from roboarm_nmp.envs.collision.edge_kernels import block_memory, check_motion
+from roboarm_nmp.envs.collision.lanes_kernels import (
+    WIDTH,
+    fused,
+    less,
+    load,
+    lowest,
+    spread,
+)
+from roboarm_nmp.envs.collision.shortening_kernels import (
+    is_path_clear,
+    random_share,
+    shortened,
+)
+from roboarm_nmp.utils.numba_cache import compiled, uncounted
+
+F32 = np.float32
+CLEAR = 5e-6
+"""m: what finished paths keep clear everywhere, so that rounding to float32 changes nothing."""
+# Nodes of a tree at most. Checks of the first two tries; then each second one may take twice as
+# many, up to the last.
+_CAPACITY, _FIRST_TRY, _LAST_TRY = 8192, 20_000, 160_000
 
 
-@compiled
-def _nearest_node(nodes, count, q):
-    """Index of the nearest of the first `count` nodes (L2), and its distance."""
-    least, nearest = FAR, 0
-    for i in range(count):
-        squared = 0.0
-        for j in range(q.shape[0]):
-            squared += (nodes[i, j] - q[j]) ** 2
-        if squared < least:
-            least, nearest = squared, i
+@uncounted
+def _nearest(nodes, columns, tree, count, q):
+    """Index of the nearest (L2) of the first `count` nodes of a tree, and its distance."""
+    n, capacity = q.shape[0], nodes.shape[1]
+    least, nearest = np.inf, 0
+    for begin in range(0, count, WIDTH):
+        # In float32 those that may be nearer, then exactly.
+        squared = spread(F32(0.0))
+        for j in range(n):
+            away = load(columns, (tree * n + j) * capacity + begin) - F32(q[j])
+            squared = fused(away, away, squared)
+        nearer = less(squared, spread(F32(least * (1.0 + 1e-5) + 1e-12)))
+        while nearer != 0:
+            i = begin + lowest(nearer)
+            nearer &= nearer - 1
+            exact = 0.0
+            for j in range(n):
+                exact += (nodes[tree, i, j] - q[j]) ** 2
+            if i < count and exact < least:
+                least, nearest = exact, i
     return nearest, math.sqrt(least)
 
 
-@compiled
+@uncounted
+def _add(nodes, columns, parents, tree, i, q, parent):
+    """Make a state node i of a tree."""
+    n, capacity = q.shape[0], nodes.shape[1]
+    parents[tree, i] = parent
+    for j in range(n):
+        nodes[tree, i, j] = q[j]
+        columns[(tree * n + j) * capacity + i] = q[j]
+
+
+@uncounted
 def _towards(start, end, reach, distance, new):
     """Write the state at most `reach` from `start` towards `end`. Returns whether it is `end`."""
-    if distance <= reach:
-        new[:] = end
-        return True
+    arrives = distance <= reach
     for j in range(start.shape[0]):
-        new[j] = start[j] + (end[j] - start[j]) * reach / distance
-    return False
+        new[j] = end[j] if arrives else start[j] + (end[j] - start[j]) * (reach / distance)
+    return arrives
 
 
 @compiled
-def rrt_connect(start, goals, samples, reach, max_checks, rule, endpoint_margins, arm, world):
-    """A path from `start` (n,) to one of `goals` (m, n) by RRT-Connect (Kuffner and LaValle, 2000).
-
-    `samples`: (s, n), the random states towards which the trees grow, after the goals themselves.
-    `reach`: L2, the longest edge. `rule`, `endpoint_margins`: as for `motion`.
-
-    Returns the path (k, n), (0, n) if there is none within `samples` and about `max_checks`, and
-    the number of checks.
-    """
-    n, m = start.shape[0], goals.shape[0]
-    capacity = max_checks + m + samples.shape[0] + 2  # an edge takes at least one check
-    nodes, parents = np.empty((2, capacity, n)), np.full((2, capacity), -1)
+def _search(start, goals, bounds, reach, checks, max_checks, random, problem, trees, memory):
+    """One try: the path (k, n), (0, n) if there is none, and the number of checks so far."""
+    (begins, numbers, endpoints), arm, arm32, world, grid = problem
+    nodes, columns, parents = trees
+    n, m, capacity = start.shape[0], goals.shape[0], nodes.shape[1]
     size = np.array([1, m])
-    nodes[0, 0], nodes[1, :m] = start, goals
-    new = np.empty(n)
-    checks = tree = 0
-    for i in range(m + samples.shape[0]):
-        if checks >= max_checks:
-            break
-        if i < m:
-            tree, target = 0, goals[i]
+    _add(nodes, columns, parents, 0, 0, start, -1)
+    for i in range(m):
+        _add(nodes, columns, parents, 1, i, goals[i], -1)
+    new, target = np.empty(n), np.empty(n)
+    phase = tree = samples = 0
+    while checks < max_checks and size[0] < capacity - WIDTH and size[1] < capacity - WIDTH:
+        while phase + 1 < begins.shape[0] and checks >= begins[phase + 1]:
+            phase += 1
+        rule, margins = numbers[phase], endpoints[phase]
+        if samples < m:  # first the goals themselves
+            target[:] = goals[samples]
+            tree = 0
         else:
-            target = samples[i - m]
-        near, distance = _nearest_node(nodes[tree], size[tree], target)
-        other = 1 - tree
+            for j in range(n):
+                share = random_share(random)
+                target[j] = bounds[0, j] + (bounds[1, j] - bounds[0, j]) * share
+        samples += 1
+        near, distance = _nearest(nodes, columns, tree, size[tree], target)
+        if distance < 1e-9:
+            tree = 1 - tree
+            continue
         _towards(nodes[tree, near], target, reach, distance, new)
-        more = motion(rule, endpoint_margins, arm, world, False, nodes[tree, near], new)
+        more = check_motion(
+            nodes[tree, near], new, False, rule, margins, arm, arm32, world, grid, memory
+        )
         checks += abs(more)
+        other = 1 - tree
         if more > 0:
             a = size[tree]
-            nodes[tree, a], parents[tree, a] = new, near
+            _add(nodes, columns, parents, tree, a, new, near)
             size[tree] += 1
             # The other tree grows to the new node, as far as it can.
-            b, distance = _nearest_node(nodes[other], size[other], nodes[tree, a])
+            b, distance = _nearest(nodes, columns, other, size[other], nodes[tree, a])
             arrived = distance < 1e-9
-            while not arrived and checks < max_checks:
+            while not arrived and size[other] < capacity - WIDTH:
                 arrived = _towards(nodes[other, b], nodes[tree, a], reach, distance, new)
-                more = motion(rule, endpoint_margins, arm, world, False, nodes[other, b], new)
+                more = check_motion(
+                    nodes[other, b], new, False, rule, margins, arm, arm32, world, grid, memory
+                )
                 checks += abs(more)
                 if more <= 0:
                     arrived = False
                     break
-                nodes[other, size[other]], parents[other, size[other]] = new, b
+                _add(nodes, columns, parents, other, size[other], new, b)
                 b = size[other]
                 size[other] += 1
                 distance -= reach
@@ -92,23 +141,22 @@ def rrt_connect(start, goals, samples, reach, max_checks, rule, endpoint_margins
 def _joined_path(nodes, parents, a, b):
     """The path from the first tree's root to its node a, then from node b to the other's root.
 
-    Both nodes are the same state.
+    Both nodes are the same state, which the path has once.
     """
-    length = 0
-    node = parents[0, a]
+    length, node = 0, a
     while node >= 0:
         length += 1
         node = parents[0, node]
-    before, node = length, b
+    before, node = length, parents[1, b]
     while node >= 0:
         length += 1
         node = parents[1, node]
     path = np.empty((length, nodes.shape[2]))
-    node = parents[0, a]
+    node = a
     for i in range(before - 1, -1, -1):
         path[i] = nodes[0, node]
         node = parents[0, node]
-    node = b
+    node = parents[1, b]
     for i in range(before, length):
         path[i] = nodes[1, node]
         node = parents[1, node]
@@ -116,32 +164,76 @@ def _joined_path(nodes, parents, a, b):
 
 
 @compiled
-def shortcut(path, chords, rule, endpoint_margins, arm, world):
-    """Shorten a path (k, n) by straight motions between two of its points, where they are free.
+def plan_path(start, goals, seed, bounds, reach, chords, checks, max_checks, problem):
+    """A path from `start` (n,) to one of `goals` (m, n), shortened. Nothing touches on it.
 
-    `chords`: (c, 2), shares of the path's length at which a shortcut begins and ends, in any order.
-    Returns the path and the number of checks.
+    Args:
+        seed: uint64.
+        bounds: (2, n), between which random states are.
+        reach: L2, the longest edge of a tree.
+        chords: how many shortcuts are tried; 0: the path is not shortened.
+        checks: how many there were before this search.
+        max_checks: about the number at which it ends.
+        problem: see the top of this file.
+
+    Returns: the path (k, n), (0, n) if there is none; the number of checks.
     """
-    checks, n = 0, path.shape[1]
-    for c in range(chords.shape[0]):
-        k = path.shape[0]
-        length = np.zeros(k)
-        for i in range(1, k):
-            length[i] = length[i - 1] + math.sqrt(np.sum((path[i] - path[i - 1]) ** 2))
-        ends, edges = np.empty((2, n)), np.zeros(2, np.int64)
-        for end in range(2):
-            share = min(chords[c]) if end == 0 else max(chords[c])
-            along = share * length[-1]
-            edge = 0
-            while edge < k - 2 and length[edge + 1] <= along:
-                edge += 1
-            part = (along - length[edge]) / max(length[edge + 1] - length[edge], 1e-12)
-            ends[end] = path[edge] + (path[edge + 1] - path[edge]) * part
-            edges[end] = edge
-        if edges[0] == edges[1]:
+    (_, numbers, _), arm, _, world, _ = problem
+    n = start.shape[0]
+    memory = block_memory(arm, world)
+    trees = (
+        np.empty((2, _CAPACITY, n)),
+        np.empty(2 * n * _CAPACITY, np.float32),
+        np.empty((2, _CAPACITY), np.int64),
+    )
+    random = np.array([seed], np.uint64)
+    memories = memory, continuous_memory(arm, world), np.array([CLEAR, 0.0, numbers[0, 2], 0.0])
+    tries, budget = 0, _FIRST_TRY
+    while checks < max_checks:
+        limit = min(checks + budget, max_checks)
+        path, checks = _search(
+            start, goals, bounds, reach, checks, limit, random, problem, trees, memory
+        )
+        tries += 1
+        if tries % 2 == 0:
+            budget = min(2 * budget, _LAST_TRY)
+        if path.shape[0] == 0:
             continue
-        more = motion(rule, endpoint_margins, arm, world, False, ends[0], ends[1])
-        checks += abs(more)
-        if more > 0:
-            path = np.concatenate((path[: edges[0] + 1], ends, path[edges[1] + 1 :]))
-    return path, checks
+        path, more = finished(path, chords, random, problem, memories)
+        checks += more
+        if path.shape[0] > 0:
+            return path, checks
+    return np.empty((0, n)), checks
+
+
+@compiled
+def finished(path, chords, random, problem, memories):
+    """A path (k, n) shortened, and the number of checks. Nothing touches anywhere on it.
+
+    (0, n) if `path` itself touches something between its states.
+    """
+    (_, numbers, endpoints), arm, arm32, world, grid = problem
+    # With the full margins again, whatever the search has come down to.
+    rule, margins = numbers[0], endpoints[0]
+    short, checks = path, 0
+    if chords > 0 and path.shape[0] > 2:
+        short, checks = shortened(
+            path, chords, random, False, rule, margins, arm, arm32, world, grid, memories
+        )
+    if is_path_clear(short, margins, arm, world, memories):
+        return short, checks
+    if not is_path_clear(path, margins, arm, world, memories):
+        return np.empty((0, path.shape[1])), checks
+    short, more = shortened(
+        path, chords, random, True, rule, margins, arm, arm32, world, grid, memories
+    )
+    return short, checks + more
+
+
+@compiled
+def finish_path(path, seed, chords, problem):
+    """`finished` of a path of another planner."""
+    _, arm, _, world, _ = problem
+    rule = np.array([CLEAR, 0.0, problem[0][1][0, 2], 0.0])
+    memories = block_memory(arm, world), continuous_memory(arm, world), rule
+    return finished(path, chords, np.array([seed], np.uint64), problem, memories)

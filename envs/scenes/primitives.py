@@ -453,22 +453,21 @@ def to_array(obstacles: Sequence[Obstacle]) -> np.ndarray:
     length) of a cylinder; three times the radius of a sphere; three times the number of a hull's
     vertices, which are in `hull_vertices`. A motion has no place in a row (`motion_numbers`).
     """
-    rows = np.zeros((len(obstacles), ROW))
-    for row, obstacle in zip(rows, obstacles, strict=True):
-        row[0] = _KINDS.index(type(obstacle))
-        row[1:4] = obstacle.position
+    rows = []
+    for obstacle in obstacles:
+        orientation = IDENTITY
         if isinstance(obstacle, Sphere):
-            row[4:8] = IDENTITY
-            row[8:11] = obstacle.radius
-            continue
-        row[4:8] = obstacle.orientation
-        if isinstance(obstacle, Box):
-            row[8:11] = obstacle.size
-        elif isinstance(obstacle, ConvexHull):
-            row[8:11] = len(obstacle.vertices)
+            size = (obstacle.radius,) * 3
         else:
-            row[8:11] = (obstacle.radius, obstacle.radius, obstacle.length)
-    return rows
+            orientation = obstacle.orientation
+            if isinstance(obstacle, Box):
+                size = obstacle.size
+            elif isinstance(obstacle, ConvexHull):
+                size = (len(obstacle.vertices),) * 3
+            else:
+                size = (obstacle.radius, obstacle.radius, obstacle.length)
+        rows.append((_KINDS.index(type(obstacle)), *obstacle.position, *orientation, *size))
+    return np.array(rows, np.float64).reshape(-1, ROW)
 
 
 def hull_vertices(obstacles: Iterable[Obstacle]) -> np.ndarray:

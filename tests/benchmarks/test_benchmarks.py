@@ -13,7 +13,7 @@ from trainers import TINIER, run_here
 @pytest.mark.parametrize(
     ("name", "flags", "expected"),
     [
-        ("planning", "--num 3 --limits 5", {"solved_in_5_s": 1.0, "queries": 3}),
+        ("planning", "--num 3", {"split": "test", "queries": 3}),
         ("demo_throughput", "--num 2 --tasks wall", {}),
         ("env_throughput", "--blocks 2 --scenes 2", {"blocks": 2}),
     ],

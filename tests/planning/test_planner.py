@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import os
 import subprocess
 import sys
 import textwrap
@@ -78,6 +79,18 @@ def test_paths_have_the_exact_ends_of_the_query_and_no_collision(worlds):
     assert bent >= 5  # many straight lines collide
 
 
+def test_finished_paths_touch_nothing_anywhere():
+    queries = load_queries("random_boxes_hard", "validation")[:40]
+    env = envs.make("random_boxes_hard")
+    planner = Planner(env)
+    for seed, query in enumerate(queries):
+        states = PANDA.normalise(planner.plan(*query, seed=seed).astype(np.float64)).clip(-1, 1)
+        checker = CollisionChecker(query.scene)
+        assert checker.is_motion_free(states[:-1], states[1:], resolution=0.001).all()
+        assert checker.is_motion_free(states[:-1], states[1:], continuous=True).all()
+    env.close()
+
+
 def test_planner_follows_a_change_of_scene(worlds):
     env, (start, goal, _) = envs.make("no_obstacles"), load_queries("wall")[4]
     planner = Planner(env)
@@ -108,7 +121,10 @@ def test_path_to_a_set_ends_at_a_goal_that_is_free(worlds):
 @pytest.mark.parametrize(
     ("goals", "complaint"),
     [
-        (np.stack([INTO_THE_WALL, INTO_ITSELF]), "none of the 2 goals is possible: goal 0 is in c"),
+        (
+            np.stack([INTO_THE_WALL, INTO_ITSELF]),
+            "none of the 2 goals is possible: the nearest one is in c",
+        ),
         (np.zeros((2, 6)), "a set of goals has shape"),
     ],
 )
@@ -155,6 +171,36 @@ def test_seed_gives_the_same_path_whatever_was_planned_before(worlds):
     assert again.tobytes() == first.tobytes() and planner.checks == checks
     fresh = Planner(worlds["double_walls"])
     assert fresh.plan(*queries[1], seed=8).tobytes() == others[1].tobytes()
+
+
+PLANS = """
+    import zlib
+    import roboarm_nmp
+    from roboarm_nmp.planning.planner import Planner
+    from roboarm_nmp.datasets.queries import load_queries
+
+    planner, digest = Planner(roboarm_nmp.make("random_boxes_hard")), 0
+    for seed, query in enumerate(load_queries("random_boxes_hard", "validation")[:50]):
+        digest = zlib.crc32(planner.plan(*query, seed=seed).tobytes(), digest)
+    print("plans:", digest)
+"""
+
+
+@pytest.mark.slow
+def test_processors_with_and_without_avx512_give_the_same_paths(tmp_path):
+    older = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx,+avx2,+fma"}
+    answers = set()
+    for change in ({}, older | {"NUMBA_CACHE_DIR": str(tmp_path)}):
+        result = subprocess.run(
+            [sys.executable, "-c", textwrap.dedent(PLANS)],
+            cwd=ROOT,
+            env=os.environ | change,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        answers.add(result.stdout.splitlines()[-1])
+    assert len(answers) == 1
 
 
 SEARCHES = """
@@ -385,6 +431,17 @@ def test_bad_constructor_argument_is_rejected(worlds, arguments, complaint):
 def test_bad_query_is_rejected(worlds, start, goal, complaint):
     with pytest.raises(ValueError, match=complaint):
         Planner(worlds["wall"]).plan(start, goal, seed=1)
+
+
+def test_further_searches_shorten_a_path_and_batches_give_the_same_paths(worlds):
+    queries = load_queries("double_walls", "validation")[:6]
+    planner = Planner(worlds["double_walls"])
+    single = [planner.plan(*query, seed=[4, i]) for i, query in enumerate(queries)]
+    batch = planner.plan_batch(queries, seed=4, num_threads=3)
+    assert [path.tobytes() for path in batch] == [path.tobytes() for path in single]
+    better = [planner.plan(*query, seed=[4, i], optimise=5) for i, query in enumerate(queries)]
+    lengths = [[length(path) for path in paths] for paths in (better, single)]
+    assert (np.array(lengths[0]) <= lengths[1]).all() and sum(lengths[0]) < 0.97 * sum(lengths[1])
 
 
 def test_search_ends_at_its_limits(worlds):

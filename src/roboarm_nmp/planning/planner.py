@@ -1,4 +1,4 @@
-"""Planning: a query in, a joint path out, by one of OMPL's planners or by one of your own.
+"""Planning: a query in, a joint path out, in a few milliseconds.
 
     import roboarm_nmp
     from roboarm_nmp.planning.planner import Planner
@@ -9,45 +9,46 @@
     path = Planner(env).plan(*query, seed=1)  # float32 (k, n), rad
     path = Planner(env).plan(query.start, goal_pose=pose, seed=1)  # of the end effector, (7,)
 
-Collisions are checked by `envs.collision.checker`. It agrees with PyBullet within a fraction of a
-millimetre and is about twenty times faster. The environment itself decides whether start and goal
-are feasible. Planning happens in the normalised configuration space [-1, 1]^n.
+The default planner is RRT-Connect with restarts, compiled as a whole together with its collision
+checks (`envs.collision.search_kernels`). OMPL's planners can be used by name, and so can one of
+your own. Collisions are checked by `envs.collision.checker`, which agrees with PyBullet within a
+fraction of a millimetre. Planning happens in the normalised configuration space [-1, 1]^n.
 """
 
+import contextlib
+import copy
 import math
-import operator
+import os
 import time
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Literal
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from ompl import base as ob
-from ompl import geometric as og
-from ompl import util as ou
 
-from roboarm_nmp.envs.arm_env import RoboArmEnv
-from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
+from roboarm_nmp.envs.arm_env import RoboArmEnv, checked_configuration
+from roboarm_nmp.envs.collision.checker import (
+    ARM,
+    FLOOR,
+    POINT,
+    REACH,
+    RESOLUTION,
+    TABLE,
+    CollisionChecker,
+    Rules,
+)
 from roboarm_nmp.envs.robots.inverse_kinematics import NUM_SEEDS, inverse_kinematics
 from roboarm_nmp.envs.robots.panda import scale_of
-from roboarm_nmp.envs.scenes.primitives import Scene
-from roboarm_nmp.envs.subgoals import subgoals
+from roboarm_nmp.envs.scenes.primitives import Scene, obstacle_at
+from roboarm_nmp.envs.subgoals import SUBGOAL_SPACING, subgoals
+from roboarm_nmp.planning.ompl_planners import OMPL_LOCK, OMPL_PLANNERS, OmplSearch, Validity
 from roboarm_nmp.utils.names import suggest
 
-# OMPL writes to the console. What concerns a user is raised here.
-ou.setLogLevel(ou.LogLevel.LOG_NONE)
-
-PLANNERS = tuple(
-    sorted(
-        name
-        for name, kind in vars(og).items()
-        if isinstance(kind, type)
-        and issubclass(kind, ob.Planner)
-        # PRM and PRMstar work in two threads: PRM's paths differ from run to run, PRMstar hangs.
-        and not name.startswith("PRM")
-    )
-)
-"""Names of OMPL's planners that can be used."""
+COMPILED = "compiled"
+"""The name of the default planner."""
+PLANNERS = (COMPILED, *OMPL_PLANNERS)
+"""Names of planners: the default one, and OMPL's that can be used."""
 
 # A configuration this close (m) to a collision counts as one, which absorbs most of the
 # controller's lag: without the margin, two of three plans on `double_walls` collide when followed.
@@ -61,13 +62,15 @@ MARGIN_GROWTH = 0.03
 # A search that has taken long is likely to take much longer, so margin and clearance shrink: after
 # so many collision checks, they are scaled by this factor.
 # (Chosen on 1,000 fresh queries of `random_boxes_hard`: docs/benchmark/performance.md.)
-MARGIN_SCHEDULE = ((0, 1.0), (4_000, 0.5), (8_000, 0.25), (16_000, 0.0))
+MARGIN_SCHEDULE = ((0, 1.0), (16_000, 0.5), (32_000, 0.25), (64_000, 0.0))
+_RULES_BEGIN = np.array([checks for checks, _ in MARGIN_SCHEDULE])
+_MARGIN_SCALES = np.array([scale for _, scale in MARGIN_SCHEDULE])
 # After so many checks without a path, RRT-Connect hands over to another planner for half as many.
 # They alternate, each turn twice as long as the last: LBKPIECE1 quickly finds some paths out of
 # shelves that RRT-Connect does not find.
 # (Chosen on the same queries, and on the original MotionBenchMaker problems:
 # docs/benchmark/performance.md.)
-OTHER_PLANNER, FIRST_TURN = "LBKPIECE1", 8_000
+OTHER_PLANNER, FIRST_TURN = "LBKPIECE1", 160_000
 # Searches at most, per plan, for a path that can be followed within an episode.
 SEARCHES = 3
 # Steps by which the arm may arrive later than its last sub-goal.
@@ -75,139 +78,40 @@ LAG = 10
 # A goal pose is a set of configurations, at most this many. Inverse kinematics begins from
 # `NUM_SEEDS` states; if it finds nothing free, again from 4, 16 and 64 times as many.
 MAX_GOALS, IK_ROUNDS = 16, 4
-# Shortcuts tried in one round of simplification, and how many may fail in a row. A limit of
-# iterations is deterministic, unlike the seconds of OMPL's simplifyMax.
-SHORTCUT_STEPS, SHORTCUT_EMPTY_STEPS = 50, 25
+# Shortcuts that the compiled planner tries in one round of simplification.
+CHORDS = 60
 
 
 class PlanningError(RuntimeError):
     """No path was found within the limits."""
 
 
-class Validity:
-    """Decides which normalised configurations and motions are free, and counts the checks.
+class _Query(NamedTuple):
+    """A start and m goals that are possible: the ends of paths.
 
-    Call it with one configuration (n numbers), or use `free` and `motions_free` for many at once.
-    `checks` is the number of configurations checked so far. `exhausted()` says whether the limits
-    of this plan are reached: a planner asks now and then, and gives up.
-
-    Args:
-        checker: a `CollisionChecker`.
-        rules: pairs of a number of checks and the arguments that hold from then on: a dict of
-            `margin`, `clearance` and `endpoint_margins` for the checker. The first number is 0.
-        deadline: the time (`time.monotonic()`, s) at which the plan is exhausted.
-        max_checks: the number of checks at which the plan is exhausted.
+    checker: the `CollisionChecker`.
+    ends: float32 (1 + m, n), rad, the start first.
+    states: float64 (1 + m, n), normalised.
+    distances: m, (2, 1 + m), of the arm from everything, and from the scene; infinite where it is
+        far.
     """
 
-    def __init__(
-        self,
-        checker: CollisionChecker,
-        rules: list[tuple[int, dict[str, Any]]],
-        deadline: float,
-        max_checks: float,
-    ):
-        self._checker = checker
-        self._rules = rules
-        self._later = list(rules)
-        self._deadline = deadline
-        self._max_checks = max_checks
-        self.checks = 0
-        self._next_rule()
-
-    def __call__(self, state: Sequence[float]) -> bool:
-        """Whether a configuration is free."""
-        state = tuple(map(float, state))
-        return self.motion_free(state, state)
-
-    def motion_free(self, start: tuple[float, ...], end: tuple[float, ...]) -> bool:
-        """Whether the straight motion from a configuration that is free to another is free.
-
-        Both are tuples of n floats.
-        """
-        checks = self._check(start, end)
-        self.checks += checks if checks > 0 else -checks  # quicker than `abs`: planners ask often
-        if self.checks >= self._next:
-            self._next_rule()
-        return checks > 0
-
-    def free(self, states: ArrayLike) -> np.ndarray:
-        """Which configurations (..., n) are free: bool (...)."""
-        free = self._checker.is_free(states, **self._rule)
-        self._count(free.size)
-        return free
-
-    def motions_free(self, starts: ArrayLike, ends: ArrayLike) -> np.ndarray:
-        """Which straight motions from `starts` (..., n) to `ends` (..., n) are free: bool (...)."""
-        checks = self._checker.motion_checks(starts, ends, **self._rule)
-        self._count(int(np.abs(checks).sum()))
-        return checks > 0
-
-    def exhausted(self) -> bool:
-        """Whether the limits of this plan are reached."""
-        return self.checks >= self._max_checks or time.monotonic() > self._deadline
-
-    def restore_margins(self) -> None:
-        """Return to the full margins, for changes to a path that has been found."""
-        self._later = [self._rules[0]]
-        self._next_rule()
-
-    def _count(self, checks):
-        self.checks += checks
-        if self.checks >= self._next:
-            self._next_rule()
-
-    def _next_rule(self):
-        """Apply the last rule whose number of checks is reached."""
-        while self._later and self._later[0][0] <= self.checks:
-            self._rule = self._later.pop(0)[1]
-        self._next = self._later[0][0] if self._later else math.inf
-        self._check = self._checker.motion_checker(**self._rule)
-
-
-class _States(ob.StateValidityChecker):
-    """Answers OMPL's question about one state."""
-
-    def __init__(self, space, is_valid):
-        super().__init__(space)
-        self._is_valid = is_valid
-        self._values = _values_of(space)
-
-    def isValid(self, state):  # noqa: N802 (OMPL's name)
-        state = self._values(state)
-        return self._is_valid.motion_free(state, state)
-
-
-class _Motions(ob.MotionValidator):
-    """Answers OMPL's question about a motion with a valid start."""
-
-    def __init__(self, space, is_valid):
-        super().__init__(space)
-        self._is_valid = is_valid
-        self._values = _values_of(space)
-
-    def checkMotion(self, start, end):  # noqa: N802
-        return self._is_valid.motion_free(self._values(start), self._values(end))
-
-
-def _values_of(space) -> Callable[[Any], tuple[float, ...]]:
-    """A function from a state of OMPL's `SpaceInformation` to a tuple of its numbers."""
-    joints = space.getStateDimension()
-    if joints == 1:
-        return lambda state: (state[0],)
-    return operator.itemgetter(*range(joints))  # in C: planners ask for millions of states
+    checker: CollisionChecker
+    ends: np.ndarray
+    states: np.ndarray
+    distances: np.ndarray
 
 
 class Planner:
     """Plans in the world of an environment.
 
     Args:
-        env: a `RoboArmEnv`; its scene may change between plans. A plan begins by resetting it to
-            the query, so reset before the next step.
+        env: a `RoboArmEnv`; its scene may change between plans. Plans do not touch it.
         planner: one of `PLANNERS`, or your own: a function `(is_valid, start, goal, rng)` that
             returns a path (k, n) from start to goal, or None. `is_valid` is a `Validity`, start
             and goal are normalised configurations (n,), float64, `rng` is a NumPy Generator. With
             several goals it is called for one after the other, until it returns a path.
-            `RRTConnect` alternates with `OTHER_PLANNER` where it takes long.
+            `compiled` and `RRTConnect` alternate with `OTHER_PLANNER` where they take long.
         clearance: metres that a path keeps from the scene, in addition to `MARGIN`. A query that
             starts or ends nearer is planned without it. `MARGIN_SCHEDULE` scales both in a long
             search. For an arm other than the Panda, both are multiplied by the ratio of their
@@ -222,7 +126,7 @@ class Planner:
         max_checks: collision checks for one plan; None for no limit. Unlike a time limit, it ends
             a search at the same point on every machine. Asymptotically optimal planners use all of
             their limit; FMT and BFMT need about 100,000 checks.
-        limits: "urdf" or "datasheet": the position limits inside which OMPL's planners plan.
+        limits: "urdf" or "datasheet": the position limits inside which the named planners plan.
 
     Raises:
         ValueError: unknown planner or limits, or a number out of range.
@@ -231,7 +135,7 @@ class Planner:
     def __init__(
         self,
         env: RoboArmEnv,
-        planner: str | Callable[..., ArrayLike | None] = "RRTConnect",
+        planner: str | Callable[..., ArrayLike | None] = COMPILED,
         clearance: float = 0.005,
         planner_range: float = 0.4,
         simplify: int = 1,
@@ -266,9 +170,10 @@ class Planner:
         self._scene = env.scene
         self._checker = geometry_source(env.scene.at(0.0))
         # Compile here what is compiled at its first call: a plan's time is for planning.
-        state = (0.0,) * env.robot.num_joints
+        state = np.zeros(env.robot.num_joints)
         self._checker.signed_distances(state)
-        self._checker.motion_checker()(state, state)
+        self._checker.motion_checker()(tuple(state), tuple(state))
+        self._checker.find_path(state, state, np.random.default_rng(0), max_checks=1)
         self.checks = 0
         """Collision checks of the last plan."""
 
@@ -281,6 +186,7 @@ class Planner:
         seed: int | Sequence[int],
         time_limit: float = 5.0,
         goal_pose: ArrayLike | None = None,
+        optimise: float = 0,
     ) -> np.ndarray:
         """A path from start to goal: float32 (k, n), rad; its ends are exactly start and goal.
 
@@ -297,13 +203,15 @@ class Planner:
             start: joint angles (n, rad), inside the `limits`.
             goal: joint angles (n, rad), inside the `limits`, or a set of goals (m, n), of which
                 those in collision, or outside the limits, are ignored.
-            scene: a `Scene` to change the environment to first.
+            scene: a `Scene` with the same arm; None: that of the environment.
             seed: int >= 0 or a sequence of such ints, as for `np.random.default_rng`.
             time_limit: seconds for all searches; `math.inf` for no limit. The plan may take a
                 little longer.
             goal_pose: instead of `goal`, a pose of the end effector (7,), as of
-                `Robot.end_effector_pose`. Only the geometry source decides which configurations
-                are free there.
+                `Robot.end_effector_pose`.
+            optimise: search on for a shorter path: a float for so many seconds, an int for so many
+                further searches, which give the same path on every machine. `time_limit` and
+                `max_checks` hold for all searches together.
 
         Raises:
             ValueError: start or goal is not n numbers inside the limits, or is in collision, or so
@@ -319,77 +227,121 @@ class Planner:
             raise ValueError(f"time_limit must be positive, got {time_limit!r}")
         if (goal is None) == (goal_pose is None):
             raise ValueError("either goal or goal_pose is needed, and not both")
-        joints = self.env.robot.num_joints
-        rng = np.random.default_rng(seed)
-        # Bad queries are rejected here, as an episode would reject them.
-        if goal is not None and np.ndim(goal) != 2:
-            if np.shape(goal) == (3,) != (joints,):  # a position, with which an episode may begin
-                raise ValueError(f"goal must have {joints} numbers, got shape (3,)")
-            self.env.reset_specific(start, goal, scene)
-            start = np.asarray(start, dtype=np.float32)
-            goals = np.asarray([goal], dtype=np.float32)
+        checker = self._checker_of(self.env.scene if scene is None else scene)
+        start = checked_configuration(checker.robot, "start", start)
+        if goal is None:
+            goals = self._goals_of_pose(checker, start, goal_pose, seed)
+        elif np.ndim(goal) == 2:
+            goals = self._set_of_goals(checker.robot, start, goal)
         else:
-            if scene is not None:
-                self.env.set_scene(scene)
-            start = self.env.check_configuration("start", start)
-            if goal is not None:
-                goals = self._free_goals(start, goal)
-            else:
-                goals = self._goals_of_pose(start, goal_pose, seed)
-        goals = self._goals_within_limits(start, goals)
+            goals = checked_configuration(checker.robot, "goal", goal)[None]
+        query = self._query(checker, start, goals, goal is not None and np.ndim(goal) == 2)
         deadline = time.monotonic() + time_limit
+        rng = np.random.default_rng(seed)
         self.checks = 0
-        best = None
+        best, least = None, math.inf
         for _ in range(SEARCHES):
-            path = self._search(start, goals, int(rng.integers(1, 2**32)), deadline)
+            path = self._search(query, int(rng.integers(1, 2**32)), deadline)
             if path is None:
                 break
-            if best is None or self._steps(path) < self._steps(best):
-                best = path
-            if self._steps(best) <= self.env.horizon - LAG:
+            steps = self._steps(checker.robot, path)
+            if steps < least:
+                best, least = path, steps
+            if least <= self.env.horizon - LAG:
                 break
         if best is None:
             raise PlanningError(
                 f"no path in {self.checks} collision checks (time_limit {time_limit} s, max_checks "
                 f"{self.max_checks})"
             )
+        return self._optimised(query, best, optimise, rng, deadline)
+
+    def _optimised(self, query, best, optimise, rng, deadline):
+        """The shortest path of `optimise` further searches, or seconds of them, and of `best`."""
+        robot = query.checker.robot
+        searches = math.inf
+        if isinstance(optimise, int):
+            searches = optimise
+        else:
+            deadline = min(deadline, time.monotonic() + optimise)
+        length = _length(robot, best)
+        while searches > 0 and time.monotonic() < deadline:
+            searches -= 1
+            path = self._search(query, int(rng.integers(1, 2**32)), deadline)
+            if path is None:
+                break
+            if _length(robot, path) < length:
+                best, length = path, _length(robot, path)
         return best
 
-    def _free_goals(self, start, goals):
-        """Those of a set of goals with which an episode can begin, nearest to the start first."""
-        joints = self.env.robot.num_joints
-        normalise = self.env.robot.normalise
-        if np.shape(goals)[1] != joints or not len(goals):
-            raise ValueError(f"a set of goals has shape (m, {joints}), got {np.shape(goals)}")
-        free = []
+    def plan_batch(
+        self,
+        queries: Iterable[tuple[ArrayLike, ArrayLike, Scene | None]],
+        *,
+        seed: int | Sequence[int],
+        time_limit: float = 5.0,
+        num_threads: int | None = None,
+    ) -> list[np.ndarray | None]:
+        """The paths of many queries, planned in several threads; None where none was found.
+
+        Path i is that of `plan(*queries[i], seed=[*seed, i])`, whatever the number of threads.
+
+        Args:
+            queries: starts, goals and scenes, as for `plan`.
+            seed: int >= 0 or a sequence of such ints.
+            time_limit: seconds for each query.
+            num_threads: by default, the number of cores.
+
+        Raises ValueError: as `plan`; the first query that is not possible.
+        """
+        seeds = [seed] if isinstance(seed, int) else list(seed)
+
+        def plan_one(numbered):
+            number, query = numbered
+            planner = copy.copy(self)  # which counts its own checks
+            try:
+                return planner.plan(*query, seed=[*seeds, number], time_limit=time_limit)
+            except PlanningError:
+                return None
+
+        with ThreadPoolExecutor(num_threads or len(os.sched_getaffinity(0))) as pool:
+            return list(pool.map(plan_one, enumerate(queries)))
+
+    def _checker_of(self, scene):
+        if scene is not self._scene:
+            if not isinstance(scene, Scene):
+                raise TypeError(f"a scene must be a Scene, got {scene!r}")
+            if not scene.robot.same_arm(self.env.robot):
+                name = self.env.robot.name
+                raise ValueError(f"the scene's robot is {scene.robot.name!r}, not {name!r}")
+            self._checker = self._geometry_source(scene.at(0.0))
+            self._scene = scene
+        return self._checker
+
+    def _set_of_goals(self, robot, start, goals):
+        """Those of a set of goals that are inside the joint limits, nearest to the start first."""
+        if np.shape(goals)[1] != robot.num_joints or not len(goals):
+            raise ValueError(
+                f"a set of goals has shape (m, {robot.num_joints}), got {np.shape(goals)}"
+            )
+        inside = []
         problem = None
         for number, goal in enumerate(goals):
             try:
-                free.append(self.env.check_configuration(f"goal {number}", goal))
+                inside.append(checked_configuration(robot, f"goal {number}", goal))
             except ValueError as error:
                 problem = problem or error
-        if not free:
+        if not inside:
             raise ValueError(f"none of the {len(goals)} goals is possible: {problem}")
-        distances = np.linalg.norm(normalise(free) - normalise(start), axis=1)
-        return np.array(free)[np.argsort(distances, kind="stable")]
+        distances = np.linalg.norm(robot.normalise(inside) - robot.normalise(start), axis=1)
+        return np.array(inside)[np.argsort(distances, kind="stable")]
 
-    def _goals_within_limits(self, start, goals):
-        """Those of the goals (m, n) that are inside the `limits`, as the start has to be."""
-        if not self._bounds:
-            return goals
-        for name, ends in (("start", [start]), ("goal", goals)):
-            inside = [end for end in ends if self.env.robot.is_within(end, self.limits)]
-            if not inside:
-                raise ValueError(f"{name} is outside the {self.limits} position limits: {ends[0]}")
-        return np.array(inside)
-
-    def _goals_of_pose(self, start, pose, seed):
+    def _goals_of_pose(self, checker, start, pose, seed):
         """Free configurations with a pose, float32 (m, n), rad, nearest to the start first.
 
         If some have the clearance that a path keeps, only those.
         """
-        checker = self._current_checker()
-        robot = self.env.robot
+        robot = checker.robot
         for round_ in range(IK_ROUNDS):
             num_seeds = NUM_SEEDS * 4**round_
             goals = inverse_kinematics(
@@ -408,168 +360,164 @@ class Planner:
                 break
         return goals[:MAX_GOALS]
 
-    def _steps(self, path):
-        return len(subgoals(path, self.env.robot))
+    def _query(self, checker, start, goals, is_set):
+        """The `_Query` from a start (n,) to those of the goals (m, n) that are possible, rad.
 
-    def _search(self, start, goals, seed, deadline):
+        Raises ValueError: the start is not, or no goal is.
+        """
+        ends = np.concatenate([start[None], goals])
+        states = np.clip(checker.robot.normalise(ends), -1.0, 1.0).astype(np.float64)
+        distances = checker.end_distances(states, self.margin + self.clearance + EXACTNESS)
+        if self._bounds or distances[0].min() < 0.0:
+            problems = [self._problem(checker, ends[0], states[0], set())]
+            # From a goal, obstacles may move away.
+            moving = _moving_obstacles(self._scene)
+            for goal, state in zip(ends[1:], states[1:], strict=True):
+                problems.append(self._problem(checker, goal, state, moving))
+            if problems[0] is not None:
+                raise ValueError(f"start {problems[0]}")
+            possible = np.array([problem is None for problem in problems])
+            if not possible[1:].any():
+                if is_set:
+                    nearest = f"the nearest one {problems[1]}"
+                    raise ValueError(f"none of the {len(goals)} goals is possible: {nearest}")
+                raise ValueError(f"goal {problems[1]}")
+            ends, states, distances = ends[possible], states[possible], distances[:, possible]
+        return _Query(checker, ends, states, distances)
+
+    def _problem(self, checker, end, state, ignored):
+        """Why a configuration (n,), in rad and normalised, cannot be an end of a path; or None.
+
+        `ignored`: obstacles that are no reason. Neither are points of a cloud: there may be some of
+        what the arm holds or touches.
+        """
+        if self._bounds and not checker.robot.is_within(end, self.limits):
+            return f"is outside the {self.limits} position limits: {end}"
+        near = checker.signed_distances(state, within=0.0)
+        hits = set(near.geometry[near.distance < 0.0].tolist()) - {POINT} - ignored
+        if not hits:
+            return None
+        names = {TABLE: "the table", FLOOR: "the floor", ARM: "itself"}
+        contacts = sorted(f"the arm with {names.get(hit, f'obstacle {hit}')}" for hit in hits)
+        return f"is in collision: {', '.join(contacts)}"
+
+    def _steps(self, robot, path):
+        """Environment steps that following a path takes, without those of an arm that is late."""
+        most = _length(robot, path) / SUBGOAL_SPACING + 2 * (1 + robot.acceleration_steps) * len(
+            path
+        )
+        if most <= self.env.horizon - LAG:
+            return most  # which is quicker to find
+        return len(subgoals(path, robot))
+
+    def _search(self, query, seed, deadline):
         """The path of one search, float32 (k, n), rad; None: there was none within the limits."""
-        is_valid = self._validity(start, goals, deadline)
-        robot = self.env.robot
-        start_state = robot.normalise(start)
-        goal_states = robot.normalise(goals)
-        # For the random number generators that OMPL makes from here on. Spaces make some, for the
-        # projections of KPIECE1 and its kin; how many must not matter to the planner.
-        ou.RNG.setSeed(seed)
-        space = self._space(is_valid)
-        ou.RNG.setSeed(seed)
-        if callable(self.planner):
-            for state in goal_states:
-                path = self.planner(is_valid, start_state, state, np.random.default_rng(seed))
-                if path is not None:
-                    path = _checked(path, start_state, state)
-                    break
-        else:
-            path = _solve(
-                _turns(self.planner), self.planner_range, space, is_valid, start_state, goal_states
-            )
-        if path is not None and self.simplify:
-            is_valid.restore_margins()
-            path = _simplify(space, path, self.simplify)
+        checker, start, goals = query.checker, query.states[0], query.states[1:]
+        left = math.inf if self.max_checks is None else self.max_checks - self.checks
+        rules = self._rules(query)
+        is_valid = Validity(checker, rules, deadline, left)
+        bounds = self._bounds or (-np.ones(len(start)), np.ones(len(start)))
+        ompl = path = None
+        with contextlib.ExitStack() as locks:
+
+            def ompl_search():
+                locks.enter_context(OMPL_LOCK)
+                return OmplSearch(is_valid, bounds, self.planner_range, start, goals, seed)
+
+            if callable(self.planner):
+                ompl = ompl_search()
+                for goal in goals:
+                    path = self.planner(is_valid, start, goal, np.random.default_rng(seed))
+                    if path is not None:
+                        path = _checked(path, start, goal)
+                        break
+            else:
+                for name, checks in _turns(self.planner):
+                    if is_valid.exhausted():
+                        break
+                    if name == COMPILED:
+                        limit = min(checks, left)
+                        path = self._compiled(query, rules, seed, bounds, is_valid, limit)
+                    else:
+                        ompl = ompl or ompl_search()
+                        path = ompl.solve(name, checks)
+                        if path is not None and self.planner == COMPILED:
+                            chords = CHORDS * self.simplify
+                            path, more = checker.finish_path(path, rules, seed, chords)
+                            is_valid.count(more)
+                    if path is not None:
+                        break
+            if self.planner != COMPILED and self.simplify and path is not None and ompl is not None:
+                is_valid.restore_margins()
+                path = ompl.simplified(path, self.simplify)
         self.checks += is_valid.checks
         if path is None:
             return None
-        reached = np.linalg.norm(goal_states - path[-1], axis=1).argmin()
-        path = robot.denormalise(path).astype(np.float32)
-        path[0] = start
-        path[-1] = goals[reached]
+        reached = np.linalg.norm(goals - path[-1], axis=1).argmin()
+        path = checker.robot.denormalise(path).astype(np.float32)
+        path[0] = query.ends[0]
+        path[-1] = query.ends[1 + reached]
         return path
 
-    def _current_checker(self):
-        if self._scene is not self.env.scene:
-            self._scene = self.env.scene
-            self._checker = self._geometry_source(self._scene.at(0.0))
-        return self._checker
+    def _compiled(self, query, rules, seed, bounds, is_valid, limit):
+        """The path of a turn of the compiled planner, shortened, (k, n); None: it found none."""
+        path, checks = query.checker.search(
+            query.states[0],
+            query.states[1:],
+            rules,
+            # Another turn has other random numbers.
+            seed=seed + (is_valid.checks << 32),
+            bounds=np.array(bounds),
+            reach=self.planner_range or REACH,
+            checks=is_valid.checks,
+            max_checks=limit,
+            chords=CHORDS * self.simplify,
+        )
+        is_valid.count(checks - is_valid.checks)
+        return path
 
-    def _validity(self, start, goals, deadline):
-        """The `Validity` of one search."""
-        checker = self._current_checker()
-        ends = np.clip(self.env.robot.normalise([start, *goals]), -1.0, 1.0)
-        near = checker.signed_distances(ends).distance.min(-1)
-        from_scene = checker.signed_distances(ends, self_collisions=False).distance.min(-1)
+    def _rules(self, query):
+        """`Rules` with margins that shrink, and are smaller around the ends."""
+        near, from_scene = query.distances
         clearance = self.clearance if from_scene.min() >= self.clearance else 0.0
-        rules = []
-        for checks, margin_scale in MARGIN_SCHEDULE:
-            # Less a hair, because the ends are checked again after normalising, which rounds.
-            distances = np.minimum(near, from_scene - margin_scale * clearance) - 1e-5
-            rule = {
-                "margin": margin_scale * self.margin,
-                "clearance": margin_scale * clearance,
-                "endpoint_margins": (ends, distances, MARGIN_GROWTH),
-            }
-            rules.append((checks, rule))
-        checks_left = math.inf if self.max_checks is None else self.max_checks - self.checks
-        return Validity(checker, rules, deadline, checks_left)
-
-    def _space(self, is_valid):
-        """OMPL's `SpaceInformation`, which asks `is_valid`."""
-        space = normalised_space(self.env.robot.num_joints, *self._bounds)
-        information = ob.SpaceInformation(space)
-        information.setStateValidityChecker(_States(information, is_valid))
-        information.setMotionValidator(_Motions(information, is_valid))
-        # For the planners that count a motion's states themselves: a share of the longest motion.
-        information.setStateValidityCheckingResolution(RESOLUTION / space.getMaximumExtent())
-        information.setup()
-        return information
+        numbers = np.empty((len(MARGIN_SCHEDULE), 4))
+        numbers[:, 0] = self.margin * _MARGIN_SCALES
+        numbers[:, 1] = clearance * _MARGIN_SCALES
+        numbers[:, 2:] = MARGIN_GROWTH, RESOLUTION
+        endpoints = np.empty((len(numbers), len(query.states), query.states.shape[1] + 1))
+        endpoints[:, :, :-1] = query.states
+        # Less a hair, because the ends are checked again after normalising, which rounds.
+        endpoints[:, :, -1] = np.minimum(near, from_scene - numbers[:, 1:2]) - 1e-5
+        return Rules(_RULES_BEGIN, numbers, endpoints)
 
 
 def _turns(planner: str) -> Iterator[tuple[str, float]]:
-    """For `_solve`: RRT-Connect and the other planner alternate, any other planner works alone.
+    """Pairs of a planner, and the number of checks at which the next one takes over.
 
-    There are more turns than anybody has time for.
+    RRT-Connect and the other planner alternate, any other planner works alone. There are more turns
+    than anybody has time for.
     """
-    if planner != "RRTConnect":
+    if planner not in (COMPILED, "RRTConnect"):
         yield planner, math.inf
         return
     checks = 0
     length = FIRST_TURN
     for _ in range(20):
-        for name, share in (("RRTConnect", length), (OTHER_PLANNER, length // 2)):
+        for name, share in ((planner, length), (OTHER_PLANNER, length // 2)):
             checks += share
             yield name, checks
         length *= 2
 
 
-def normalised_space(
-    num_joints: int, lower: Sequence[float] | None = None, upper: Sequence[float] | None = None
-) -> ob.RealVectorStateSpace:
-    """OMPL's view of the normalised configuration space, or of a box (n,), (n,) in it."""
-    bounds = ob.RealVectorBounds(num_joints)
-    for joint in range(num_joints):
-        bounds.setLow(joint, -1.0 if lower is None else float(lower[joint]))
-        bounds.setHigh(joint, 1.0 if upper is None else float(upper[joint]))
-    space = ob.RealVectorStateSpace(num_joints)
-    space.setBounds(bounds)
-    return space
+def _moving_obstacles(scene):
+    """The indices in `scene.at(0.0).obstacles` of those that move or disappear."""
+    present = [one for one in scene.obstacles if obstacle_at(one, 0.0) is not None]
+    return {number for number, obstacle in enumerate(present) if obstacle.motion is not None}
 
 
-def _state(space, values):
-    state = space.allocState()
-    for i, value in enumerate(values):
-        # float32 may round a limit to just beyond it.
-        state[i] = min(max(float(value), -1.0), 1.0)
-    return state
-
-
-def _solve(turns, planner_range, space, is_valid, start, goals):
-    """Normalised path (k, n) by OMPL's planners; None: there is none within the limits.
-
-    The path ends at one of `goals`, (m, n).
-    `turns`: pairs of a planner's name and the number of checks at which the next planner takes
-    over. A planner that had a turn before continues its search.
-    """
-    problem = ob.ProblemDefinition(space)
-    if len(goals) == 1:
-        problem.setStartAndGoalStates(_state(space, start), _state(space, goals[0]))
-    else:
-        problem.addStartState(_state(space, start))
-        several = ob.GoalStates(space)
-        for goal in goals:
-            several.addState(_state(space, goal))
-        problem.setGoal(several)
-    planners = {}
-    for name, checks in turns:
-        if name not in planners:
-            planners[name] = planner = getattr(og, name)(space)
-            planner.setProblemDefinition(problem)
-            if hasattr(planner, "setRange"):
-                planner.setRange(planner_range)
-            planner.setup()
-
-        def over(checks=checks):
-            return is_valid.checks >= checks or is_valid.exhausted()
-
-        planners[name].solve(ob.PlannerTerminationCondition(over))
-        if problem.hasExactSolution():
-            return _to_array(problem.getSolutionPath(), len(start))
-        if is_valid.exhausted():
-            break
-    return None
-
-
-def _simplify(space, path, rounds):
-    geometric = og.PathGeometric(space)
-    for state in path:
-        geometric.append(_state(space, state))
-    simplifier = og.PathSimplifier(space)
-    for _ in range(rounds):
-        simplifier.reduceVertices(geometric, 0, 0)
-        simplifier.partialShortcutPath(geometric, SHORTCUT_STEPS, SHORTCUT_EMPTY_STEPS)
-    simplifier.collapseCloseVertices(geometric)
-    return _to_array(geometric, len(path[0]))
-
-
-def _to_array(path, num_joints):
-    return np.array([[state[i] for i in range(num_joints)] for state in path.getStates()])
+def _length(robot, path):
+    """L2, normalised, of a path (k, n), rad."""
+    return float(np.linalg.norm(np.diff(robot.normalise(path), axis=0), axis=1).sum())
 
 
 def _checked(path, start, goal):

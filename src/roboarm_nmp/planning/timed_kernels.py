@@ -28,17 +28,11 @@ def free_in_time(states, steps, rule, endpoint_margins, arm, rows, cloud, free):
     """
     memory, last = working_memory(arm[0], arm[1]), rows.shape[0] - 1
     points, groups, ball = cloud
-    axes, sweeps, lists = np.empty((0, 3)), np.empty(0), np.empty((0, 0, 2), np.int64)
-    known = lists, 0, -1
     for i in range(states.shape[0]):
         free[i] = True
         for step in range(steps[i], steps[i] + 2):
             world = rows[min(step, last)], points, groups, ball
-            near = is_free(
-                states[i], rule, endpoint_margins, arm, world, memory, axes, sweeps, 0.0, known,
-                lists, 0,
-            )  # fmt: skip
-            if near < 0:
+            if not is_free(states[i], rule, endpoint_margins, arm, world, memory):
                 free[i] = False
                 break
 

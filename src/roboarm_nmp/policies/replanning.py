@@ -40,7 +40,7 @@ PREDICTED, LEAST_APPROACH = np.arange(1, 17, 3), 0.002
 # many checks it may take until the next ones are tried. After each failure twice as many checks, up
 # to MAX_EFFORT times, with as much smaller margins. Steps from a failed plan to the next one, as
 # many times.
-LEVELS = ((0.01, 0.015, 2_000), (0.01, 0.0, 3_000), (0.003, 0.0, 3_000))
+LEVELS = ((0.01, 0.015, 8_000), (0.01, 0.0, 12_000), (0.003, 0.0, 12_000))
 # A waiting arm goes back if it will be nearer to what approaches than RETREAT_DISTANCE (m) in
 # RETREAT_STEPS, and if that distance is larger by RETREAT_GAIN (m) at one of the last places.
 RETREAT_DISTANCE, RETREAT_STEPS, RETREAT_GAIN = 0.05, 10, 0.01

@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from paths import ROOT
+from scipy.spatial import ConvexHull
+from scipy.spatial.distance import cdist
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.queries import load_queries
@@ -21,6 +23,8 @@ from roboarm_nmp.envs.collision.checker import (
     CollisionChecker,
 )
 from roboarm_nmp.envs.collision.gjk_kernels import BULLET_MARGIN
+from roboarm_nmp.envs.collision.hulls import arm_hulls, vertex_counts
+from roboarm_nmp.envs.collision.spheres import hull_spheres
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.urdf import robot_from_urdf
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
@@ -380,13 +384,39 @@ def test_motion_through_a_thin_board_is_not_free():
     assert checker.is_motion_free(LEFT, LEFT)
     assert CollisionChecker(Scene()).is_motion_free(LEFT, RIGHT)
     assert checker.is_motion_free(LEFT, [LEFT, RIGHT, LEFT + 0.01]).tolist() == [True, False, True]
-    # The board is in the middle, which is checked after the start and the end.
-    assert checker.motion_checks(LEFT, RIGHT) == -3
+
+
+def test_continuous_check_finds_what_lies_between_states(wall):
+    checker = CollisionChecker(BOARD)
+    assert checker.is_motion_free(LEFT, RIGHT, resolution=10.0)  # of its ends alone
+    assert not checker.is_motion_free(LEFT, RIGHT, continuous=True)
+    assert checker.is_motion_free(LEFT, [LEFT, LEFT + 0.01], continuous=True).all()
+    rng = np.random.default_rng(0)
+    starts = rng.uniform(-1.0, 1.0, (400, 7))
+    starts = starts[wall.is_free(starts)]
+    ends = (starts + rng.normal(0.0, 0.1, starts.shape)).clip(-1.0, 1.0)
+    clear = wall.is_motion_free(starts, ends, continuous=True)
+    fine = wall.is_motion_free(starts, ends, resolution=0.001)
+    assert 0.2 < clear.mean() < 0.95 and not (clear & ~fine).any() and (fine & ~clear).sum() <= 1
+
+
+def test_spheres_cover_hulls_and_lie_in_them():
+    rng, (_, _, _, vertices, _) = np.random.default_rng(0), arm_hulls(PANDA)
+    first = 0
+    for number in vertex_counts(PANDA):
+        mesh = vertices[first : first + number]
+        first += number
+        outer, inner = hull_spheres(mesh)
+        points = np.concatenate([mesh, rng.dirichlet(np.full(number, 0.05), 3000) @ mesh])
+        assert (cdist(points, outer[:, :3]) <= outer[:, 3]).any(1).all()
+        planes = ConvexHull(mesh).equations
+        depths = -(inner[:, :3] @ planes[:, :3].T + planes[:, 3]).max(1)
+        assert (inner[:, 3] > 0.0).all() and (inner[:, 3] <= depths).all()
 
 
 def test_known_ends_are_not_checked():
     checker = CollisionChecker(BOARD)
-    assert checker.motion_checks(LEFT, RIGHT, ends_known=True) == -1  # the middle
+    assert checker.motion_checks(LEFT, RIGHT, ends_known=True) < 0  # the board is in the middle
     into = (LEFT + RIGHT) / 2
     pieces = math.ceil(np.linalg.norm(into - LEFT) / collision.RESOLUTION)
     steps = LEFT + (into - LEFT) * np.arange(pieces + 1)[:, None] / pieces

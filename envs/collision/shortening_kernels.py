@@ -1,0 +1,108 @@
+"""Compiled shortening of paths: vertices are left out, and corners are cut."""
+
+import math
+
+import numpy as np
+
+from roboarm_nmp.envs.collision.continuous_kernels import is_motion_clear
+from roboarm_nmp.envs.collision.edge_kernels import check_motion
+from roboarm_nmp.utils.numba_cache import compiled, uncounted
+
+
+@uncounted
+def random_share(random):
+    """A random number in [0, 1) by SplitMix64 (Steele et al., 2014). `random`: its state (1,)."""
+    random[0] += np.uint64(0x9E3779B97F4A7C15)
+    z = random[0]
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    z = z ^ (z >> np.uint64(31))
+    return (z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
+
+
+@uncounted
+def _distance(a, b):
+    squared = 0.0
+    for j in range(a.shape[0]):
+        squared += (a[j] - b[j]) ** 2
+    return math.sqrt(squared)
+
+
+@uncounted
+def _is_free(start, end, certain, rule, margins, arm, arm32, world, grid, memories):
+    """Number of checks of a motion, negative if it is not free; `certain`: between states, too."""
+    memory, continuous, clear_rule = memories
+    checks = check_motion(start, end, False, rule, margins, arm, arm32, world, grid, memory)
+    if checks <= 0 or not certain:
+        return checks
+    is_clear = is_motion_clear(start, end, clear_rule, margins, arm, world, continuous)
+    return checks if is_clear else -checks
+
+
+@compiled
+def is_path_clear(path, margins, arm, world, memories):
+    """Whether nothing touches anywhere on a path (k, n)."""
+    _, continuous, clear_rule = memories
+    for i in range(path.shape[0] - 1):
+        if not is_motion_clear(path[i], path[i + 1], clear_rule, margins, arm, world, continuous):
+            return False
+    return True
+
+
+@compiled
+def shortened(path, chords, random, certain, rule, margins, arm, arm32, world, grid, memories):
+    """A path (k, n) with fewer vertices and shorter, and the number of checks.
+
+    First, of each vertex, the straight motion to the last vertex that it can reach. Then `chords`
+    straight motions between random points of the path, where they are free. With `certain`, they
+    are checked between states, too.
+    """
+    n, count, checks = path.shape[1], path.shape[0], 0
+    path = path.copy()
+    i = 0
+    while i < count - 2:
+        for j in range(count - 1, i + 1, -1):
+            more = _is_free(
+                path[i], path[j], certain, rule, margins, arm, arm32, world, grid, memories
+            )
+            checks += abs(more)
+            if more > 0:
+                path[i + 1 : count - (j - i - 1)] = path[j:count].copy()
+                count -= j - i - 1
+                break
+        i += 1
+    # Each chord adds a vertex at most.
+    points, along = np.empty((count + chords, n)), np.zeros(count + chords)
+    points[:count] = path[:count]
+    begin, end = np.empty(n), np.empty(n)
+    for _ in range(chords):
+        if count < 3:
+            break
+        for i in range(1, count):
+            along[i] = along[i - 1] + _distance(points[i - 1], points[i])
+        one, other = random_share(random), random_share(random)
+        first = _at(points, along, count, min(one, other) * along[count - 1], begin)
+        last = _at(points, along, count, max(one, other) * along[count - 1], end)
+        if first == last:
+            continue
+        more = _is_free(begin, end, certain, rule, margins, arm, arm32, world, grid, memories)
+        checks += abs(more)
+        if more > 0:
+            # The vertices up to `first`, the chord's ends, the vertices from `last` + 1 on.
+            points[first + 3 : first + 3 + count - last - 1] = points[last + 1 : count].copy()
+            points[first + 1] = begin
+            points[first + 2] = end
+            count += 2 - (last - first)
+    return points[:count].copy(), checks
+
+
+@uncounted
+def _at(points, along, count, length, point):
+    """Write the path's point at a length; returns the index of the vertex before it."""
+    edge = 0
+    while edge < count - 2 and along[edge + 1] <= length:
+        edge += 1
+    part = (length - along[edge]) / max(along[edge + 1] - along[edge], 1e-12)
+    for j in range(point.shape[0]):
+        point[j] = points[edge, j] + (points[edge + 1, j] - points[edge, j]) * part
+    return edge
