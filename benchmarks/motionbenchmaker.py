@@ -27,7 +27,7 @@ from markdown_tables import write_csv
 from roboarm_nmp.datasets.import_problems import import_problems, summary
 from roboarm_nmp.datasets.problems import load_problems
 from roboarm_nmp.envs import RoboArmEnv
-from roboarm_nmp.planning.following import follow
+from roboarm_nmp.envs.following import follow
 from roboarm_nmp.planning.planner import Planner, PlanningError
 from roboarm_nmp.utils.progress import progress_bar
 

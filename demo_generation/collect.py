@@ -24,9 +24,9 @@ from roboarm_nmp.datasets.demonstrations import demo_path, write_demos
 from roboarm_nmp.datasets.journal import Journal, journal_of
 from roboarm_nmp.datasets.queries import query_path, validate
 from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.following import Execution, follow
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Scene, from_lists, to_lists
-from roboarm_nmp.planning.following import Execution, follow
 from roboarm_nmp.planning.planner import Planner, PlanningError
 from roboarm_nmp.utils import flags, workers
 from roboarm_nmp.utils.files import check_writable

@@ -20,8 +20,8 @@ from roboarm_nmp.datasets.demonstrations import Demo, demo_path, load_demos, wri
 from roboarm_nmp.datasets.format import DatasetError, locate
 from roboarm_nmp.demo_generation.collect import Demonstration, demonstrate, make_planner
 from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.following import Execution, follow
 from roboarm_nmp.envs.tasks import is_task
-from roboarm_nmp.planning.following import Execution, follow
 from roboarm_nmp.utils import flags, workers
 from roboarm_nmp.utils.flags import CORES, Workers
 from roboarm_nmp.utils.progress import progress_bar, write_line
@@ -52,7 +52,8 @@ class Verifier:
         self.env = RoboArmEnv(self.demos.scenes.base)
         options = self.demos.parameters["options"]
         self.allow_collisions = options["allow_collisions"]
-        self.planner = make_planner(self.env, options)
+        # Recorded motions were not planned, and cannot be planned anew.
+        self.planner = make_planner(self.env, options) if "planner" in options else None
 
     def __call__(self, index: int) -> tuple[int, str, dict | None]:
         """`(index, verdict, demo)`: one of `VERDICTS`, and, with `repair`, the repaired demo.
@@ -70,6 +71,8 @@ class Verifier:
             return index, verdict, None
         if verdict in ("good", "changed"):
             return index, verdict, _columns(Demonstration(demo.plan, execution, seed))
+        if self.planner is None:
+            return index, verdict, None
         rng = np.random.default_rng([seed, index])
         repaired = demonstrate(
             self.planner,

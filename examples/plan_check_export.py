@@ -16,8 +16,8 @@ import numpy as np
 import roboarm_nmp
 from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.following import follow
 from roboarm_nmp.motions.trajectories import save_joint_path, timed
-from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
 
 

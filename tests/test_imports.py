@@ -28,7 +28,7 @@ ENV_ROWS = [
     ("scenes", "subgoals", "goals"),
     ("world", "collision", "tasks"),
     ("arm_env", "perception"),
-    ("wrappers",),
+    ("wrappers", "following"),
     ("__init__",),  # `make`
 ]
 MOST_ROOMS, MOST_FLOORS, MOST_PAIRS = 17, 9, 75

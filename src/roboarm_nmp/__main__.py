@@ -33,11 +33,11 @@ COMMANDS = {
     "retime": ("motions.retime", "make an executable trajectory of a joint path"),
     "sweep": ("clean_rl_scripts.sweep", "search a trainer's flags with Optuna"),
     "plan": ("demo_generation.plan", "plan a motion among points or in a scene"),
-    "import": ("datasets.import_problems", "import problems from other programs' files"),
+    "import": ("datasets.import_problems", "import problems, or motions of a LeRobot dataset"),
     "queries": ("demo_generation.make_queries", "make a query file"),
     "collect": ("demo_generation.collect", "collect demonstrations"),
     "verify": ("demo_generation.verify", "replay demonstrations in the simulator"),
-    "minari": ("demo_generation.export_minari", "export demonstrations as a Minari dataset"),
+    "export": ("demo_generation.export", "export demonstrations as a LeRobot or Minari dataset"),
     "roadmaps": (
         "demo_generation.roadmaps",
         "make roadmap paths, for `roboarm train roadmap-bc --paths`",

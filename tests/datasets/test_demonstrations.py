@@ -13,9 +13,9 @@ from roboarm_nmp.datasets import format as dataset_format
 from roboarm_nmp.datasets.demonstrations import QUANTUM, describe, load_demos, write_demos
 from roboarm_nmp.datasets.format import DatasetError
 from roboarm_nmp.datasets.queries import load_queries
+from roboarm_nmp.envs.following import follow
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.subgoals import SUBGOAL_SPACING, subgoals
-from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
 
 

@@ -1,6 +1,6 @@
 """datasets/episodes.py: episodes on demonstrations' queries, and which fit an environment.
 
-(The contents of episodes, by hand: test_sac_her_mp.py and test_export_minari.py.)
+(The contents of episodes, by hand: test_sac_her_mp.py.)
 """
 
 import numpy as np

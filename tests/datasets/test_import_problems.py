@@ -88,20 +88,16 @@ def test_goals_that_cannot_be_reached_are_left_out(tmp_path):
     assert not rejected and kept[0].goals.tolist() == GOALS[1:]
 
 
-def test_file_is_replaced_only_if_asked(folder, tmp_path):
+def test_file_is_replaced_only_if_asked_and_by_usable_problems(folder, tmp_path, capsys):
     output = write_file(tmp_path / "problems.h5", "mine")
     with pytest.raises(SystemExit, match="exists; --overwrite replaces it"):
         run(folder, "--output", output)
-    assert output.read_text() == "mine"
+    bad = write_folder(tmp_path / "bad", scene=IN_THE_CAN)
+    with pytest.raises(SystemExit, match="no problem can be used: nothing was written"):
+        run(bad, "--output", output, "--overwrite")
+    assert output.read_text() == "mine" and "imported 0 of 1" in capsys.readouterr().out
     run(folder, "--output", output, "--overwrite")
     assert len(load_problems(output)) == 3
-
-
-def test_nothing_is_written_without_a_usable_problem(tmp_path, capsys):
-    folder = write_folder(tmp_path / "shelf", scene=IN_THE_CAN)
-    with pytest.raises(SystemExit, match="no problem can be used: nothing was written"):
-        run(folder, "--output", tmp_path / "a.h5")
-    assert "imported 0 of 1" in capsys.readouterr().out and not (tmp_path / "a.h5").exists()
 
 
 def test_evaluation_names_the_file_and_its_hash(folder, tmp_path, capsys):

@@ -27,9 +27,9 @@ from roboarm_nmp.datasets.format import DatasetError
 from roboarm_nmp.datasets.journal import VERSION, line_of
 from roboarm_nmp.demo_generation import collect
 from roboarm_nmp.demo_generation.verify import VERDICTS, Verifier, verify
+from roboarm_nmp.envs.following import follow
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import from_array, scene_to_json
-from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
 from roboarm_nmp.utils import workers
 

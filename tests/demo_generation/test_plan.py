@@ -7,10 +7,10 @@ from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.demo_generation import plan
 from roboarm_nmp.envs import make
 from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.following import follow
 from roboarm_nmp.envs.perception.sensors import PointCloud, SensorWorld, cardinal
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.motions.trajectories import load_joint_path, load_trajectory
-from roboarm_nmp.planning.following import follow
 from roboarm_nmp.utils import flags
 
 POLICY = "roadmap-bc-combined-point_cloud-random_boxes_hard-s1"

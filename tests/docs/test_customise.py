@@ -11,6 +11,8 @@ from problem_files import write_folder
 from trainers import PATHS, load
 
 from roboarm_nmp import envs
+from roboarm_nmp.datasets.demonstrations import load_demos
+from roboarm_nmp.datasets.lerobot import load_joint_names
 from roboarm_nmp.datasets.problems import load_problems
 from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.demo_generation import plan
@@ -49,6 +51,15 @@ def test_problems_of_the_page_are_read_and_written(tmp_path, monkeypatch, capsys
     names = names_of("customise/problems.md")
     assert len(load_problems("problems.h5")) == 1 and names["env"].robot == names["wide"]
     assert "True" in capsys.readouterr().out
+
+
+def test_recordings_of_the_page_are_demonstrations(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert names_of("customise/motions.md")["refused"] == []
+    assert len(load_demos("teleop.h5")) == 10
+    names = re.search(r"```yaml\n(.*?)```", (ROOT / "docs/customise/motions.md").read_text(), re.S)
+    (tmp_path / "joints.yaml").write_text(names[1])
+    assert load_joint_names("joints.yaml").joints["panda_joint1"] == "shoulder_pan.pos"
 
 
 def test_sensor_of_the_page_observes_heights_of_obstacles():

@@ -18,6 +18,7 @@ from roboarm_nmp import envs
 from roboarm_nmp.clean_rl_scripts import evaluate as command
 from roboarm_nmp.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.following import follow
 from roboarm_nmp.envs.perception.noise import SensorNoise
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.files import save_scene
@@ -27,7 +28,6 @@ from roboarm_nmp.evaluation import evaluate as evaluation
 from roboarm_nmp.evaluation.evaluate import EvaluationError, evaluate
 from roboarm_nmp.evaluation.report import report
 from roboarm_nmp.networks.export import save_network
-from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
 from roboarm_nmp.policies.safety_filter import VERSION, SafetyFilter
 from roboarm_nmp.utils.signals import error_line

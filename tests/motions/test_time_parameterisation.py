@@ -106,11 +106,24 @@ def test_corners_are_rounded_by_the_deviation_at_most(deviation):
         assert deviation == 0.0 or found > 0.3 * deviation
 
 
-def test_dense_waypoints_on_a_line_do_not_slow_the_arm_down():
+@pytest.mark.parametrize("noise", [0.0, 1e-4, 1e-3])
+def test_dense_waypoints_and_noise_do_not_slow_the_arm_down(noise):
     ends = np.array([START, moved(q1=1.0), moved(q1=1.0, q2=0.5)])
-    dense = np.concatenate([np.linspace(a, b, 50) for a, b in zip(ends, ends[1:], strict=False)])
-    sparse, dense = (time_parameterise(path, PANDA).duration for path in (ends, dense))
-    assert dense == pytest.approx(sparse, abs=0.01)
+    dense = np.concatenate([np.linspace(a, b, 1500) for a, b in zip(ends, ends[1:], strict=False)])
+    dense += noise * np.random.default_rng(0).normal(size=dense.shape)
+    sparse, dense = (time_parameterise(path, PANDA) for path in (ends, dense))
+    assert dense.duration == pytest.approx(sparse.duration, rel=0.02)
+    assert distances(dense.positions, ends).max() < 0.1
+
+
+def test_waypoints_near_the_lines_between_others_stay_where_these_collide():
+    path = np.array([START, moved(q1=0.5, q4=-1.491), moved(q1=1.0)])
+    x, y, z = PANDA.forward_kinematics(moved(q1=0.5))
+    scene = Scene((Sphere((x, y, z - 0.012), 0.005),), table=None, floor=None)
+    trajectory = time_parameterise(path, PANDA, checker=CollisionChecker(scene))
+    assert distances(path[1:2], trajectory.positions).max() < 3e-3
+    with pytest.raises(ValueError, match="the path itself collides"):
+        time_parameterise(path[[0, 2]], PANDA, checker=CollisionChecker(scene))
 
 
 @pytest.mark.parametrize("scale", [1e-7, 1e-2])

@@ -8,13 +8,13 @@ import pytest
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.queries import Query, load_queries
 from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.following import follow
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.motions import Oscillation, Presence, Waypoints
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.evaluation.rollout import Episode, rollout
 from roboarm_nmp.planning import space_time
-from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import PlanningError
 from roboarm_nmp.planning.space_time import SpaceTimePlanner
 from roboarm_nmp.planning.timed_checker import TimedChecker

@@ -4,13 +4,15 @@
     trajectory = time_parameterise(path, env.robot, checker=CollisionChecker(query.scene))
     save_trajectory("motion.yaml", trajectory)
 
-Needs the extra `trajectories` (toppra). Three steps:
+Needs the extra `trajectories` (toppra). Four steps:
 
-1. The corners of the path are rounded by parabolas, which leave it by at most `deviation`.
-2. TOPP-RA (Pham and Pham, IEEE Transactions on Robotics 34(3), 2018) finds the shortest time along
+1. The path is fitted: waypoints within a tenth of `deviation` of the lines between others are left
+   out. So a recording with noise, of thousands of points, takes no longer than a clean path.
+2. The corners of the path are rounded by parabolas, which leave it by at most `deviation`.
+3. TOPP-RA (Pham and Pham, IEEE Transactions on Robotics 34(3), 2018) finds the shortest time along
    the rounded path within the limits of velocity and acceleration.
-3. The result, sampled every `step`, becomes the control points of a uniform cubic B-spline.
-   Positions, velocities and accelerations of the spline are weighted means of those of step 2, with
+4. The result, sampled every `step`, becomes the control points of a uniform cubic B-spline.
+   Positions, velocities and accelerations of the spline are weighted means of those of step 3, with
    positive weights. So they keep the limits at every time, not only at the samples, and the jerk is
    bounded: by twice the acceleration per `step`. Where the arm's limit of the jerk is lower, the
    control points are averaged first.
@@ -19,11 +21,13 @@ Where the rounded path collides, the nearest corners are rounded less, and at la
 the arm stops at the corner, and is exactly on the path before and after it.
 """
 
+import contextlib
 import math
 from typing import Literal
 
 import numpy as np
 
+from roboarm_nmp.datasets.recordings import fit_path
 from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
 from roboarm_nmp.envs.robots.robot import DEFAULT_VELOCITY, Robot
 from roboarm_nmp.motions.trajectories import JointTrajectory
@@ -39,8 +43,8 @@ LIMIT_TOLERANCE = 0.01
 """rad: the simulated arm of an episode exceeds its limits by up to this; it is clipped."""
 CHECK_RESOLUTION = RESOLUTION / 16  # of collision checks; the planner's own checks are coarser
 GRAZE = 0.001  # m: an additional margin, where the path has it, for what is between two checks
-SAME = 1e-6  # rad: waypoints nearer than that are one
-STRAIGHT = 1e-4  # rad: waypoints that the line between their neighbours misses by less are left out
+FIT = 1 / 10  # of the deviation: waypoints nearer to the lines between others are left out
+STRAIGHT = 1e-4  # rad, likewise without a deviation, or where what is left collides
 SHORTEST = 1e-3  # rad: shorter lines between two rounded corners have no cell of their own
 SHARPEST = 2 * math.sin(math.radians(75))  # change of direction; at sharper corners the arm stops
 SHRINK = 1 / 4  # of a rounding that collides
@@ -75,7 +79,7 @@ def time_parameterise(
             `Planner.plan`, or `Trajectory.configurations` of an episode.
         robot: the `Robot`, with n joints.
         deviation: rad, L2: how far the trajectory may be from the path at rounded corners; 0 to
-            stop at each corner. Step 3 adds at most acceleration * step^2 / 6 (0.3 mrad).
+            stop at each corner. Step 4 adds at most acceleration * step^2 / 6 (0.3 mrad).
         checker: a `CollisionChecker` of the scene; None: collisions are not checked.
         margin: m, that the trajectory keeps from the scene and the arm from itself.
         limits: "urdf" or "datasheet": which position limits of the robot hold.
@@ -99,25 +103,30 @@ def time_parameterise(
         _bound("acceleration", acceleration, robot.acceleration, DEFAULT_ACCELERATION, robot),
         _bound("jerk", jerk, robot.jerk, math.inf, robot),
     )
-    polyline = Polyline(path)
-    if len(polyline.points) == 1:
+    exact = Polyline(path, STRAIGHT)
+    if len(exact.points) == 1:
         state = np.clip(robot.normalise(path[0]), -1.0, 1.0)
         if checker is not None and not checker.is_free(state, margin=margin):
             raise ValueError("the path itself collides: it is one configuration")
-        return _spline(np.repeat(polyline.points, 4, axis=0), step, robot, path)
+        return _spline(np.repeat(exact.points, 4, axis=0), step, robot, path)
+    fitted = Polyline(path, max(STRAIGHT, FIT * deviation))
+    deviation = max(0.0, deviation - FIT * deviation)
+    margins = (margin,) if checker is None else (margin + GRAZE, margin)
+    polylines = (fitted, exact) if len(fitted.points) < len(exact.points) else (exact,)
+    attempts = [(polyline, wide) for wide in margins for polyline in polylines]
+    for polyline, wide in attempts[:-1]:
+        # The path may be nearer than that to obstacles, or need the waypoints that were left out.
+        with contextlib.suppress(ValueError):
+            return _trajectory(polyline, deviation, bounds, step, robot, path, checker, wide)
+    return _trajectory(exact, deviation, bounds, step, robot, path, checker, margin)
+
+
+def _trajectory(polyline, deviation, bounds, step, robot, path, checker, margin):
+    """A `JointTrajectory` whose corners are rounded by `deviation` at most, with a margin."""
     half_widths = polyline.half_widths(deviation)
     if checker is None:
         controls, _ = _controls(polyline, half_widths, bounds, step)
         return _spline(controls, step, robot, path)
-    try:
-        wide = margin + GRAZE
-        return _free_trajectory(polyline, half_widths, bounds, step, robot, path, checker, wide)
-    except ValueError:  # the path itself is nearer than that
-        return _free_trajectory(polyline, half_widths, bounds, step, robot, path, checker, margin)
-
-
-def _free_trajectory(polyline, half_widths, bounds, step, robot, path, checker, margin):
-    """A `JointTrajectory` whose corners are rounded by `half_widths` at most, with a margin."""
     least = LEAST * half_widths
     while True:
         controls, at = _controls(polyline, half_widths, bounds, step)
@@ -178,7 +187,7 @@ def _bound(name, argument, of_robot, default, robot):
 
 
 class Polyline:
-    """A path without repeated and collinear waypoints, by its length s from the start (rad, L2).
+    """A path by its length s from the start (rad, L2), as `fit_path` makes it with a tolerance.
 
     Attributes:
         points: waypoints (k, n), rad.
@@ -186,8 +195,8 @@ class Polyline:
         directions: unit vectors (k - 1, n).
     """
 
-    def __init__(self, path: np.ndarray):
-        self.points = _without_collinear(path)
+    def __init__(self, path: np.ndarray, tolerance: float):
+        self.points = fit_path(path, tolerance)
         moves = np.diff(self.points, axis=0)
         sizes = np.linalg.norm(moves, axis=1)
         self.lengths = np.concatenate([[0.0], np.cumsum(sizes)])
@@ -242,28 +251,6 @@ class Polyline:
                 pieces = []
             at = corner + width
         return sections
-
-
-def _without_collinear(path):
-    """A path (k, n) without waypoints that are on the line between their neighbours."""
-    moved = np.linalg.norm(np.diff(path, axis=0), axis=1) > SAME
-    path = path[np.concatenate([[True], moved])]
-    keep = np.zeros(len(path), dtype=bool)
-    keep[[0, -1]] = True
-    stack = [(0, len(path) - 1)]
-    while stack:  # Douglas and Peucker (1973)
-        first, last = stack.pop()
-        inner = path[first + 1 : last] - path[first]
-        chord = path[last] - path[first]
-        if not len(inner):
-            continue
-        share = np.clip(inner @ chord / max(chord @ chord, SAME**2), 0.0, 1.0)
-        misses = np.linalg.norm(inner - share[:, None] * chord, axis=1)
-        if misses.max() > STRAIGHT or np.any(np.diff(share) < 0):
-            middle = first + 1 + int(misses.argmax())
-            keep[middle] = True
-            stack += [(first, middle), (middle, last)]
-    return path[keep]
 
 
 # --- Times

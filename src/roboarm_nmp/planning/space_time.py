@@ -3,7 +3,7 @@
     from roboarm_nmp.planning.space_time import SpaceTimePlanner
 
     path = SpaceTimePlanner(env).plan(*query, seed=1)   # float32 (k, n), rad: where to be each step
-    follow(env, path, query.scene)                      # planning.following
+    follow(env, path, query.scene)                      # envs.following
 
 The planner makes a probabilistic roadmap of random configurations, and searches it by safe-interval
 path planning (Phillips and Likhachev, 2011): of each node, the intervals of time in which the arm
@@ -24,10 +24,10 @@ from scipy.spatial import KDTree
 
 from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.following import follow
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.subgoals import SUBGOAL_SPACING
-from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import MARGIN_GROWTH, PlanningError
 from roboarm_nmp.planning.timed_checker import TimedChecker
 

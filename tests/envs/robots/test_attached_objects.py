@@ -10,6 +10,7 @@ from roboarm_nmp import envs
 from roboarm_nmp.datasets.problem_formats import Problem
 from roboarm_nmp.datasets.problems import load_problems, write_problems
 from roboarm_nmp.envs.collision.checker import ARM, CollisionChecker
+from roboarm_nmp.envs.following import follow
 from roboarm_nmp.envs.perception.point_clouds import obstacle_points
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, ROBOT, Camera, PointCloud, SensorWorld
 from roboarm_nmp.envs.robots.metadata import check_robot
@@ -29,7 +30,6 @@ from roboarm_nmp.envs.scenes.primitives import (
 )
 from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
 from roboarm_nmp.envs.world import World
-from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
 from roboarm_nmp.utils.documents import DocumentError
 

@@ -9,6 +9,7 @@ from roboarm_nmp.datasets.queries import load_queries, write_queries
 from roboarm_nmp.envs import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.collision.moving import free_over_time
+from roboarm_nmp.envs.following import follow
 from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.variants import with_attached
@@ -29,7 +30,6 @@ from roboarm_nmp.envs.scenes.primitives import (
 from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
 from roboarm_nmp.envs.tasks import get_task
 from roboarm_nmp.envs.world import World
-from roboarm_nmp.planning.following import follow
 from roboarm_nmp.planning.planner import Planner
 from roboarm_nmp.planning.timed_checker import TimedChecker
 from roboarm_nmp.utils.documents import DocumentError

@@ -52,7 +52,7 @@ TINY = {
     "demo_generation.roadmaps": "--output paths --task wall --scenes 1 --paths-per-scene 2"
     " --num-nodes 50 --workers 1",
     "demo_generation.verify": "demos_of_wall.h5 --workers 1",
-    "demo_generation.export_minari": "--file demos_of_wall.h5 --overwrite",
+    "demo_generation.export": "--format minari --file demos_of_wall.h5 --overwrite",
     "scene_embedding_train.collect": "--num 1 --image-size 16 --num-samples 100 --workers 1"
     " --output seen",
     "viewer.show": "wall --output a.png --size 32 32",

@@ -1,20 +1,23 @@
-"""Export demonstrations as a Minari dataset, the format of many offline-learning libraries.
+"""Export demonstrations to the formats of other libraries: LeRobot's and Minari's datasets.
 
-    pip install -e ".[minari]"
-    roboarm minari --task double_walls --goal-type ee
-    roboarm minari --task no_obstacles@arm.yaml
+    roboarm export --format lerobot --task double_walls --output double_walls_lerobot
+    roboarm export --format minari --task double_walls --goal-type ee
+    roboarm export --format minari --task no_obstacles@arm.yaml
 
-Then `minari.load_dataset("roboarm-nmp/double_walls/ee-v0")` has the demonstrations as episodes of
-the task's environment, each up to the first step that reaches its goal. The dataset is in Minari's
-local storage: `~/.minari/datasets`, or the folder in MINARI_DATASETS_PATH.
+`lerobot` writes a folder, version 3.0 of LeRobot's format, with the whole motions in rad. `minari`
+writes into Minari's local storage, `~/.minari/datasets` or the folder in MINARI_DATASETS_PATH:
+`minari.load_dataset("roboarm-nmp/double_walls/ee-v0")` has the demonstrations as episodes of the
+task's environment, each up to the first step that reaches its goal.
 
 Demonstration files round configurations to 0.0002 of the normalised space. That is exact enough for
 training, but the errors accumulate when the actions of an episode are replayed: one episode in a
-hundred ends just short of its goal. With --exact, replaying the actions repeats the episode.
+hundred ends just short of its goal. With --exact, replaying the actions of a Minari dataset repeats
+the episode.
 
-Minari makes the environment again from its Gymnasium id and arguments. So this works for fixed
-scenes, not for scenes that vary. Files of a scene or of another arm are named by their absolute
-paths: on another machine, `recover_environment(task=...)` names them.
+Both formats have no scenes, and Minari makes the environment again from its Gymnasium id and
+arguments. So this works for fixed scenes, not for scenes that vary. Files of a scene or of another
+arm are named by their absolute paths: on another machine, `recover_environment(task=...)` names
+them.
 """
 
 import contextlib
@@ -31,11 +34,13 @@ import numpy as np
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.demonstrations import Demo, Demos, demo_path, load_demos
 from roboarm_nmp.datasets.episodes import demo_episode
+from roboarm_nmp.datasets.lerobot import write_lerobot
 from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.following import follow
 from roboarm_nmp.envs.subgoals import MAX_STEP, subgoals
 from roboarm_nmp.envs.tasks import has_name, split_robot
-from roboarm_nmp.planning.following import follow
 from roboarm_nmp.utils import flags
+from roboarm_nmp.utils.files import check_folder
 from roboarm_nmp.utils.progress import progress_bar
 from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
@@ -45,19 +50,25 @@ GoalType = Literal["ee", "config", "combined", "pose"]
 
 @dataclass
 class Args:
+    format: Literal["lerobot", "minari"]
+    """Format of the dataset. Each needs the extra of its name."""
     task: str | None = None
     """Task with a fixed scene, a name or a scene file, with another arm as TASK@FILE: export its
     demonstrations."""
     file: Path | None = None
     """Demonstration file to export instead of the task's own. Those of a scene file, or of another
     arm, need --task, too."""
+    output: Path | None = None
+    """LeRobot: the folder to write. The default is `<task>_lerobot` in this folder."""
+    images: bool = False
+    """LeRobot: add an image to each frame (about 50 frames a second)."""
     goal_type: GoalType = "ee"
-    """Kind of the goals."""
+    """Minari: kind of the goals."""
     dataset_id: str | None = None
     """Minari's name for the dataset. The default is `roboarm-nmp/<task>/<goal type>-v0`, or
     `roboarm-nmp/<task>-<robot>/<goal type>-v0`."""
     exact: bool = False
-    """Follow the plans again for exact configurations (about 50 episodes a second)."""
+    """Minari: follow the plans again for exact configurations (about 50 episodes a second)."""
     overwrite: bool = False
     """Replace the dataset, if it exists."""
 
@@ -228,12 +239,27 @@ def main(args: Args):
             demos = load_demos(demo_path(args.task), args.task)
         else:
             raise ValueError("give --task, or the --file of a named task of the Panda")
-        dataset_id, steps = export(
-            demos, args.goal_type, args.dataset_id, args.exact, args.overwrite, task=args.task
-        )
+        if args.format == "lerobot":
+            name, steps = _export_lerobot(args, demos)
+        else:
+            name, steps = export(
+                demos, args.goal_type, args.dataset_id, args.exact, args.overwrite, task=args.task
+            )
     except (ImportError, OSError, ValueError) as error:  # a DatasetError is a ValueError
         sys.exit(error_line(error))
-    print(f"{dataset_id}: {len(demos)} episodes, {steps} steps")
+    print(f"{name}: {len(demos)} episodes, {steps} steps")
+
+
+def _export_lerobot(args, demos):
+    """(folder, number of frames)"""
+    folder = args.output or Path(f"{demos.task.replace('@', '-')}_lerobot")
+    check_folder(folder.parent)
+    with contextlib.ExitStack() as stack:
+        env = None
+        if args.images:
+            env = envs.make(args.task or demos.task, render_mode="rgb_array")
+            stack.enter_context(contextlib.closing(env))
+        return folder, write_lerobot(folder, demos, env, args.overwrite)
 
 
 if __name__ == "__main__":
