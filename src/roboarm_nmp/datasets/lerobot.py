@@ -280,7 +280,7 @@ def load_joint_names(path: str | Path) -> JointNames:
             elif key in ("state", "action"):
                 found[key] = text(node, key)
             else:
-                raise Mistake(key, f"unknown key {key!r}: joints, state, action or degrees")
+                raise Mistake(node, f"unknown key {key!r}: joints, state, action or degrees")
     return JointNames(**found)
 
 
@@ -302,7 +302,7 @@ def read_lerobot(
     """
     check_pyarrow()
     import pyarrow as pa
-    import pyarrow.dataset
+    from pyarrow.dataset import dataset as open_dataset
 
     folder = Path(folder)
     names = names or JointNames()
@@ -320,7 +320,7 @@ def read_lerobot(
         raise DatasetError(f"{folder / 'data'}: no .parquet files")
     wanted = ["episode_index", "frame_index", "timestamp", *columns]
     try:
-        dataset = pa.dataset.dataset([str(file) for file in files], format="parquet")
+        dataset = open_dataset([str(file) for file in files], format="parquet")
         if dataset.count_rows() > MAX_FRAMES:
             raise ValueError(f"more than {MAX_FRAMES:,} frames")
         table = dataset.to_table(columns=wanted)

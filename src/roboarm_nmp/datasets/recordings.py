@@ -324,15 +324,16 @@ def write_demonstrations(
     kept: list[tuple[np.ndarray, Execution, Recording]] = []
     refused = []
     for number, (motion, (waypoints, execution)) in enumerate(zip(motions, results, strict=True)):
-        reason = None if execution is not None else waypoints
-        if execution is not None:
-            (key,) = query_keys(waypoints[:1], waypoints[-1:])
-            reason = taken.get(key)
-            taken[key] = f"has the start and goal of recording {motion.name or number}"
-        if reason is None:
-            kept.append((waypoints, execution, motion))
+        name = motion.name or str(number)
+        if execution is None:
+            refused.append(Rejected(name, waypoints))  # the reason
+            continue
+        (key,) = query_keys(waypoints[:1], waypoints[-1:])
+        if key in taken:
+            refused.append(Rejected(name, taken[key]))
         else:
-            refused.append(Rejected(motion.name or str(number), str(reason)))
+            taken[key] = f"has the start and goal of recording {name}"
+            kept.append((waypoints, execution, motion))
     if not kept:
         first = f": {refused[0].reason}" if refused else ""
         raise DatasetError(f"{path}: no recording can be used, of {len(motions)}{first}")
