@@ -107,21 +107,14 @@ def test_round_trip_is_exact_up_to_rounding(path, made):
 
 
 def test_demonstrations_are_indexed_like_queries(path):
-    demos, queries = load_demos(path), load_queries("wall")
-    assert queries[-1].start.tolist() == queries[len(queries) - 1].start.tolist()
+    demos = load_demos(path)
     assert demos[-1].digest == demos[4].digest and demos[np.int64(1)].digest == demos[1].digest
     for index in (slice(1, 4), [4, 0], np.arange(5) > 2):
-        chosen = np.arange(5)[index]
-        fewer = demos[index]
-        assert len(fewer) == len(queries[: len(chosen)]) == len(chosen)
-        for one, i in zip(fewer, chosen, strict=True):
+        for one, i in zip(demos[index], np.arange(5)[index], strict=True):
             for name in ("start", "goal", "plan", "states", "actions", "digest"):
                 np.testing.assert_array_equal(getattr(one, name), getattr(demos[i], name))
             assert one.scene == demos[i].scene
     assert describe(demos[:2])["steps"] == np.mean([len(demos[i].actions) for i in (0, 1)])
-    for data, number in ((demos, 5), (demos, -6), (queries, len(queries))):
-        with pytest.raises(IndexError):
-            data[number]
     with pytest.raises(IndexError, match="demonstration 5 of 5"):
         demos[5]
 
@@ -157,14 +150,6 @@ def test_actions_lead_to_the_next_subgoal_and_are_clipped(path):
     assert 0 < clipped < 0.5 * len(demos.actions)
 
 
-def test_subgoals_are_those_by_the_book(made):
-    for plan in made[0]:
-        points = subgoals(plan, PANDA)
-        np.testing.assert_allclose(points, naive_subgoals(plan), rtol=0, atol=1e-12)
-        assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() <= SUBGOAL_SPACING + 1e-12
-    assert subgoals(plan[[0, 0]], PANDA).shape == (2, 7)  # standing still
-
-
 def test_subgoals_speed_up_and_slow_down_between_waypoints():
     steps = 5
     robot = dataclasses.replace(PANDA, acceleration_steps=steps)
@@ -189,13 +174,12 @@ def test_statistics_equal_those_by_hand(tmp_path):
     arguments["parameters"] = {"counts": {"queries_given_up": 1, "attempts": 5, "collided": 2}}
     write_demos(tmp_path / "demos.h5", **arguments)
     numbers = describe(load_demos(tmp_path / "demos.h5"))
-    half = (PANDA.upper - PANDA.lower) / 2
-    lengths, ratios = [], []
+    half, lengths, ratios = (PANDA.upper - PANDA.lower) / 2, [], []
     for states, plan in zip(arguments["executions"], arguments["plans"], strict=True):
         moves = np.diff(states.astype(np.float64), axis=0)
-        lengths.append(sum(np.linalg.norm(move * half) for move in moves))
+        lengths.append(np.linalg.norm(moves * half, axis=1).sum())
         straight = np.linalg.norm((plan[-1] - plan[0].astype(np.float64)) / half)
-        ratios.append(sum(np.linalg.norm(move) for move in moves) / straight)
+        ratios.append(np.linalg.norm(moves, axis=1).sum() / straight)
     expected = {
         "demonstrations": 3,
         "steps": (2 + 1 + 3) / 3,
@@ -212,29 +196,6 @@ def test_statistics_equal_those_by_hand(tmp_path):
     assert numbers == pytest.approx(expected, rel=1e-3)
 
 
-# --- Replayed
-
-
-@pytest.mark.parametrize("goal_type", ["ee", "config"])
-def test_actions_lead_to_the_goal(path, goal_type):
-    env, reached = envs.make("wall", goal_type=goal_type), 0
-    for demo in load_demos(path):
-        env.reset_specific(demo.start, demo.goal)
-        closest = np.inf
-        for action in demo.actions:
-            _, _, terminated, _, info = env.step(action)
-            distance = info["config_distance" if goal_type == "config" else "ee_distance"]
-            closest = min(closest, distance)
-            if terminated:
-                break
-        reached += info["is_success"]
-        assert not info["collision_so_far"]
-        # Rounding errors of states accumulate over the actions: some may end just outside.
-        assert closest <= 1.5 * (0.05 if goal_type == "config" else 0.02)
-    assert reached >= 4  # of 5
-    env.close()
-
-
 # --- Rejected when writing
 
 
@@ -247,16 +208,11 @@ def a_test_query(arguments):
     arguments["plans"][1][0], arguments["plans"][1][-1] = start, goal
 
 
-def a_plan_outside_the_limits(arguments):
-    arguments["plans"][2][1, 3] = 0.1
-
-
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
         (the_same_query_twice, "1 queries are in it twice"),
         (a_test_query, "1 queries are test queries of no_obstacles"),
-        (a_plan_outside_the_limits, r"plan\[6\] is outside the joint limits"),
     ],
 )
 def test_bad_demonstrations_are_not_written(path, change, complaint):

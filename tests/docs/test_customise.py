@@ -12,7 +12,6 @@ from trainers import PATHS, load
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.demonstrations import load_demos
-from roboarm_nmp.datasets.lerobot import load_joint_names
 from roboarm_nmp.datasets.problems import load_problems
 from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.demo_generation import plan
@@ -57,9 +56,6 @@ def test_recordings_of_the_page_are_demonstrations(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert names_of("customise/motions.md")["refused"] == []
     assert len(load_demos("teleop.h5")) == 10
-    names = re.search(r"```yaml\n(.*?)```", (ROOT / "docs/customise/motions.md").read_text(), re.S)
-    (tmp_path / "joints.yaml").write_text(names[1])
-    assert load_joint_names("joints.yaml").joints["panda_joint1"] == "shoulder_pan.pos"
 
 
 def test_sensor_of_the_page_observes_heights_of_obstacles():

@@ -7,7 +7,7 @@ import pytest
 
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.primitives import Box, Scene, Sphere
+from roboarm_nmp.envs.scenes.primitives import Scene, Sphere
 from roboarm_nmp.motions import retime
 from roboarm_nmp.motions.time_parameterisation import time_parameterise
 from roboarm_nmp.motions.trajectories import load_trajectory, save_joint_path
@@ -58,16 +58,9 @@ def test_limits_hold_at_and_between_samples(step):
             assert (np.abs(found) <= limit * (1 + 1e-5)).all()
         assert (trajectory.positions >= PANDA.lower).all()
         assert (trajectory.positions <= PANDA.upper).all()
-        assert np.abs(trajectory.velocities / PANDA.velocity).max() > 0.9  # and it is not slow
-
-
-def test_trajectory_begins_and_ends_at_rest_at_the_ends_of_the_path():
-    for path in random_paths(2):
-        trajectory = time_parameterise(path, PANDA)
-        np.testing.assert_array_equal(trajectory.positions[[0, -1]], path[[0, -1]])
+        np.testing.assert_array_equal(trajectory.positions[[0, -1]], path[[0, -1]])  # at rest
         assert not trajectory.velocities[[0, -1]].any()
-        assert not trajectory.accelerations[[0, -1]].any()
-        np.testing.assert_allclose(np.diff(trajectory.times), 0.01, rtol=1e-6)
+        assert np.abs(trajectory.velocities / PANDA.velocity).max() > 0.9  # and it is not slow
 
 
 def test_velocities_and_accelerations_are_those_of_the_positions():
@@ -151,14 +144,6 @@ def test_corner_whose_rounding_collides_is_rounded_less():
     assert free.duration < trajectory.duration < stop.duration
     again = time_parameterise(path, PANDA, deviation=0.3, checker=checker)
     np.testing.assert_array_equal(trajectory.positions, again.positions)
-
-
-def test_path_that_collides_itself_is_rejected():
-    path = np.array([START, moved(q1=1.0)])
-    middle = PANDA.forward_kinematics(moved(q1=0.5))
-    scene = Scene((Box(tuple(middle), (0.1,) * 3),), table=None, floor=None)
-    with pytest.raises(ValueError, match="the path itself collides"):
-        time_parameterise(path, PANDA, checker=CollisionChecker(scene))
 
 
 def test_path_outside_the_datasheet_limits_is_rejected_only_for_them():
