@@ -18,15 +18,22 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from roboarm_nmp.datasets.cloud_flags import (
+    CloudFlags,
+    check_without_cloud,
+    configuration_in,
+    numbers_in,
+    observed_scene,
+)
 from roboarm_nmp.envs.robots.robot import Robot
-from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS, ObservedScene, Scene
+from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.files import check_writable
-from roboarm_nmp.utils.flags import NonNegativeFloat, NonNegativeInt, PositiveFloat, Seed
+from roboarm_nmp.utils.flags import PositiveFloat, Seed
 from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
 if TYPE_CHECKING:  # imported when they are needed, so that --help does not wait for Numba
@@ -34,22 +41,15 @@ if TYPE_CHECKING:  # imported when they are needed, so that --help does not wait
     from roboarm_nmp.evaluation.rollout import Trajectory
     from roboarm_nmp.motions.trajectories import JointTrajectory
 
-CLOUD_FLAGS = (
-    *("robot", "units", "frame", "intrinsics", "recorded_at", "arm_distance", "table"),
-    *("workspace", "cell", "min_points", "allow_empty", "point_radius"),
-)
 
-
-@dataclass
-class Args:
+@dataclass(kw_only=True)
+class Args(CloudFlags):
     start: str
     """joint angles at the start, rad, separated by spaces"""
     goal: str | None = None
     """joint angles at the goal, rad"""
     goal_pose: str | None = None
     """instead: the end effector's pose at the goal, x y z (m) and a quaternion x y z w"""
-    cloud: Path | None = None
-    """the point cloud: a .ply, .pcd, .npy or .npz file, or a depth image (with --intrinsics)"""
     task: str | None = None
     """instead of a cloud: a task, one of `roboarm_nmp.TASKS`, or a scene file (.yaml); with another
     arm, TASK@FILE"""
@@ -59,32 +59,6 @@ class Args:
     policy: str = "planner"
     """`planner`, another baseline, a policy network, a run's folder, or the name of a pretrained
     policy (`roboarm policies`)"""
-    units: Literal["m", "cm", "mm"] | None = None
-    """of the lengths in the file; by default m, and mm for a .png"""
-    frame: str | None = None
-    """pose of the cloud's frame, or of the camera, in the frame of the robot's base: x y z (m) and
-    a quaternion x y z w; by default the same frame"""
-    intrinsics: str | None = None
-    """of the depth image's camera: fx fy cx cy, pixels"""
-    recorded_at: str | None = None
-    """joint angles of the arm when the cloud was recorded, rad, whose points are left out; by
-    default the start"""
-    arm_distance: NonNegativeFloat | None = None
-    """m: points nearer to the arm than this are its own; by default 0.02"""
-    table: bool = True
-    """the standard table and floor are there, and their points are left out; otherwise all that is
-    there are points"""
-    workspace: str | None = None
-    """lower and upper corner, x y z x y z, m: points outside are left out; by default a cube that
-    the arm cannot leave"""
-    cell: PositiveFloat | None = None
-    """m: one point stays per cube of this size; by default 0.025, scaled with the arm's reach"""
-    min_points: NonNegativeInt | None = None
-    """a cube is an outlier if it and the 26 around it have fewer points; by default 3"""
-    allow_empty: bool = False
-    """plan even if nearly all points of the cloud are left out as not finite or out of reach"""
-    point_radius: NonNegativeFloat = POINT_RADIUS
-    """m, of the ball around each point"""
     seed: Seed = 0
     """of random numbers"""
     time_limit: PositiveFloat = 5.0
@@ -94,31 +68,6 @@ class Args:
     path has none (extra `trajectories`); otherwise the motion has the speed of the environment"""
     output: Path | None = None
     """write the motion to this file, .csv, .npz, .json or .yaml (docs/guide/trajectories.md)"""
-
-
-ALMOST_ALL = 0.99  # of a cloud's points: its units or its frame are probably others
-
-
-def _numbers(flag: str, text: str, number: int) -> np.ndarray:
-    """So many finite numbers in the text of a flag, float64. Raises ValueError."""
-    try:
-        values = np.array([float(word) for word in text.replace(",", " ").split()])
-    except ValueError as error:
-        raise ValueError(f"{flag}: {error}") from error
-    if len(values) != number or not np.isfinite(values).all():
-        raise ValueError(f"{flag} must be {number} finite numbers, got {text!r}")
-    return values
-
-
-def _configuration(flag: str, text: str, robot: Robot) -> np.ndarray:
-    """A configuration (n,), rad, in the text of a flag. Raises ValueError: outside the limits."""
-    configuration = _numbers(flag, text, robot.num_joints)
-    outside = np.abs(robot.normalise(configuration)) > 1.0 + 1e-6
-    if outside.any():
-        joint = int(outside.argmax())
-        limits = f"{robot.lower[joint]:.4f} to {robot.upper[joint]:.4f}"
-        raise ValueError(f"{flag}: joint {joint + 1} is outside its limits, {limits} rad")
-    return configuration
 
 
 def _task_scene(args: Args) -> Scene:
@@ -134,58 +83,16 @@ def _task_scene(args: Args) -> Scene:
     return scene.sample(np.random.default_rng(args.seed))
 
 
-def _observed_scene(args: Args, path: Path, robot: Robot) -> ObservedScene:
-    """The `ObservedScene` of the cloud, which is prepared and described."""
-    from roboarm_nmp.datasets.cloud_files import load_cloud
-    from roboarm_nmp.envs.perception.point_clouds import prepare_cloud
-    from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE
-
-    if args.recorded_at is None:
-        recorded_at = _configuration("--start", args.start, robot)
-    else:
-        recorded_at = _configuration("--recorded-at", args.recorded_at, robot)
-    frame = None if args.frame is None else _numbers("--frame", args.frame, 7)
-    intrinsics = None
-    if args.intrinsics is not None:
-        intrinsics = _numbers("--intrinsics", args.intrinsics, 4).tolist()
-    table, floor = (TABLE, FLOOR) if args.table else (None, None)
-    options = {
-        name: getattr(args, name)
-        for name in ("cell", "min_points", "arm_distance")
-        if getattr(args, name) is not None
-    }
-    if args.workspace is not None:
-        options["workspace"] = _numbers("--workspace", args.workspace, 6).reshape(2, 3)
-    cloud = load_cloud(path, args.units, frame, intrinsics)
-    prepare_cloud(cloud[:0], robot, recorded_at)  # what happens once per arm, outside of the time
-    began = time.perf_counter()
-    points, removed = prepare_cloud(cloud, robot, recorded_at, table=table, floor=floor, **options)
-    seconds = time.perf_counter() - began
-    left_out = [f"{number:,} {step}" for step, number in removed.items() if number]
-    print(f"{path}: {len(cloud):,} points; left out: {', '.join(left_out) or 'none'}")
-    print(f"{len(points):,} points remain, prepared in {1000 * seconds:.0f} ms")
-    unusable = removed["not finite"] + removed["outside the workspace"]
-    if unusable >= ALMOST_ALL * len(cloud) and not args.allow_empty:
-        raise ValueError(
-            f"{path}: {unusable:,} of {len(cloud):,} points are not finite or out of reach, so "
-            f"obstacles may be missing: check --units, --frame and --workspace, or plan without "
-            f"them (--allow-empty)"
-        )
-    return ObservedScene(
-        points=points, point_radius=args.point_radius, robot=robot, table=table, floor=floor
-    )
-
-
 def _goal(args: Args, robot: Robot, start: np.ndarray) -> dict[str, np.ndarray]:
     """The goal as an argument of `Planner.plan`: `goal` (n,), rad, or `goal_pose` (7,)."""
     from roboarm_nmp.policies.pose_goals import goal_configuration
 
     if args.goal_pose is not None:
-        pose = _numbers("--goal-pose", args.goal_pose, 7)
+        pose = numbers_in("--goal-pose", args.goal_pose, 7)
         if goal_configuration(robot, pose, start) is None:
             raise ValueError("--goal-pose: the arm cannot reach it")
         return {"goal_pose": pose}
-    return {"goal": _configuration("--goal", args.goal or "", robot)}
+    return {"goal": configuration_in("--goal", args.goal or "", robot)}
 
 
 def _check_end(
@@ -297,9 +204,9 @@ def _check(args: Args):
     if (args.cloud is None) == (args.task is None):
         raise ValueError("one of --cloud and --task is needed")
     if args.cloud is None:
-        for name in CLOUD_FLAGS:
-            if getattr(args, name) != getattr(Args, name):
-                raise ValueError(f"--{name.replace('_', '-')} goes with --cloud")
+        check_without_cloud(args)
+        if args.robot is not None:
+            raise ValueError("--robot goes with --cloud: name the arm of a task as TASK@FILE")
     if (args.goal is None) == (args.goal_pose is None):
         raise ValueError("one of --goal and --goal-pose is needed")
 
@@ -322,10 +229,11 @@ def _plan(args: Args) -> bool:
         check_ending(args.output)
         check_writable(args.output)
     if args.cloud is not None:
-        scene = _observed_scene(args, args.cloud, load_robot(args.robot or PANDA.name))
+        robot = load_robot(args.robot or PANDA.name)
+        scene, _ = observed_scene(args, robot, configuration_in("--start", args.start, robot))
     else:
         scene = _task_scene(args)
-    start = _configuration("--start", args.start, scene.robot)
+    start = configuration_in("--start", args.start, scene.robot)
     checker = CollisionChecker(scene)
     goal = _goal(args, scene.robot, start)
     if args.cloud is not None:

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from roboarm_nmp.envs.goals import GOAL_TYPES, GoalTypeName, Tolerances
+from roboarm_nmp.envs.point_images import OBSERVED_COLOUR, point_image
 from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.robots.rotations import rotation_angle, signed
-from roboarm_nmp.envs.scenes.primitives import Scene, is_number
+from roboarm_nmp.envs.scenes.primitives import ObservedScene, Scene, is_number
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.world import HOLD_STEPS, MAX_EDGE, World, image_array, why_no_window
 from roboarm_nmp.utils.bullet import pybullet as p
@@ -606,14 +607,17 @@ class RoboArmEnv(gym.Env):
     # --- Images
 
     def render(self) -> np.ndarray | None:
-        """With `rgb_array`: a uint8 image (height, width, 3) of the arm, scene and goal."""
+        """With `rgb_array`: a uint8 image (height, width, 3) of the arm, scene and goal.
+
+        Points of an `ObservedScene` are orange.
+        """
         self.world.check_open()
         if self.render_mode != "rgb_array":
             return None
         width, height = self.render_size
         view = p.computeViewMatrixFromYawPitchRoll((0.15, 0.0, 0.3), 2.1, 55, -28, 0, 2)
         projection = p.computeProjectionMatrixFOV(50, width / height, 0.1, 10.0)
-        _, _, pixels, _, _ = p.getCameraImage(
+        _, _, pixels, depth, _ = p.getCameraImage(
             width,
             height,
             view,
@@ -622,7 +626,12 @@ class RoboArmEnv(gym.Env):
             renderer=p.ER_TINY_RENDERER,
             physicsClientId=self.client,
         )
-        return image_array(pixels, width, height)
+        image = image_array(pixels, width, height)
+        if isinstance(self.scene, ObservedScene):
+            cloud = self.scene.points, self.scene.point_radius, OBSERVED_COLOUR
+            points = point_image([cloud], view, projection, self.render_size)
+            image, _ = points.over(image, np.reshape(depth, (height, width)))
+        return image
 
     def close(self) -> None:
         """Disconnect from PyBullet. Closing twice is allowed."""

@@ -25,7 +25,7 @@ ROWS = [
 # The environment's own files and packages, likewise.
 ENV_ROWS = [
     ("robots",),
-    ("scenes", "subgoals", "goals"),
+    ("scenes", "subgoals", "goals", "point_images"),
     ("world", "collision", "tasks"),
     ("arm_env", "perception"),
     ("wrappers", "following"),

@@ -7,6 +7,7 @@
     roboarm view wall --policy demo
     roboarm view wall --trajectory motion.yaml
     roboarm view roadmaps
+    roboarm view --cloud table.ply --trajectory motion.yaml
     roboarm view wall --policy planner --record replay.html
 
 Several policies stand side by side, each with its own copy of the scene. The page offers queries,
@@ -36,6 +37,7 @@ import numpy as np
 import tyro
 
 from roboarm_nmp import envs
+from roboarm_nmp.datasets.cloud_flags import CloudFlags, check_without_cloud
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Sphere
@@ -48,6 +50,7 @@ from roboarm_nmp.utils.flags import NonNegativeFloat, NonNegativeInt, PositiveFl
 from roboarm_nmp.utils.signals import end_with_one_line, error_line
 from roboarm_nmp.viewer.episodes import (
     DEMO,
+    cloud_episodes,
     demonstration_episodes,
     roadmap_episodes,
     task_episodes,
@@ -79,10 +82,11 @@ POINT_CLOUD_PLANNER = "planner (point cloud)"  # in the page's list of policies
 NO_OBSTACLE = "none"
 
 
-@dataclass
-class Args:
-    task: tyro.conf.Positional[str]
-    """the task's name, the path of a scene file (.yaml), or a folder of roadmap paths"""
+@dataclass(kw_only=True)
+class Args(CloudFlags):
+    task: tyro.conf.Positional[str | None] = None
+    """the task's name, the path of a scene file (.yaml), or a folder of roadmap paths; not needed
+    with --cloud, where no_obstacles@FILE names another arm"""
     policy: tuple[str, ...] = ()
     """the policies, side by side: `go-to-goal`, `random`, `via-points`, `planner`, a policy
     network, a run's folder with a `policy.onnx` in it, or the name of a pretrained policy; `demo`
@@ -289,6 +293,8 @@ class _Page:
                 "start": "start",
                 "goal": "goal",
                 "observed": "observed points",
+                "left_out": "points that were left out",
+                "swept": "the arm along the motion",
                 "decoded": "decoded points",
                 "distances": "link distances",
                 "correction": "filter corrections",
@@ -297,6 +303,8 @@ class _Page:
             for option in self.drawing.OPTIONS:
                 if option == "decoded" and simulation.robot.arm != PANDA:
                     continue  # pretrained encoders are the Panda's
+                if option == "left_out" and simulation.episodes.left_out is None:
+                    continue
                 box = gui.add_checkbox(names[option], option in self.drawing.show)
                 box.on_update(lambda event, o=option: self.do(self._show, o, event.target.value))
         with gui.add_folder("Edit"):
@@ -518,6 +526,14 @@ def new_obstacle(kind: str, robot: Robot) -> Box | Cylinder | Sphere:
 def _check(args: Args):
     """Raises ValueError for arguments that cannot be used, before any work."""
     flags.check(args)
+    if args.cloud is not None:
+        args.task = args.task or "no_obstacles"
+        if DEMO in args.policy:
+            raise ValueError("--cloud goes with a trajectory or a policy: leave out --policy demo")
+    else:
+        check_without_cloud(args)
+    if args.task is None:
+        raise ValueError("name a task or a scene file, or give --cloud FILE")
     if Path(args.task).is_dir():
         if DEMO in args.policy or args.trajectory is not None:
             raise ValueError("demonstrations and --trajectory go with a task, not with a folder")
@@ -573,7 +589,10 @@ def _simulation(args: Args) -> "Simulation":
     """The `Simulation` of the arguments, without policies, on its first query."""
     from roboarm_nmp.viewer.simulation import RecordedArm, Simulation
 
-    if Path(args.task).is_dir():
+    assert args.task is not None  # it is checked
+    if args.cloud is not None:
+        episodes = cloud_episodes(args.task, args, args.seed, args.trajectory)
+    elif Path(args.task).is_dir():
         episodes = roadmap_episodes(args.task)
     elif DEMO in args.policy:
         episodes = demonstration_episodes(args.task)

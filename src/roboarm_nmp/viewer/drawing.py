@@ -12,12 +12,14 @@ import numpy as np
 from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH, find_geometry_source
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, observed_points
 from roboarm_nmp.envs.perception.sensors import SceneObservation
+from roboarm_nmp.envs.point_images import LEFT_OUT_COLOUR, OBSERVED_COLOUR
 from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.primitives import (
     Box,
     ConvexHull,
     Cylinder,
+    ObservedScene,
     Sphere,
     hull_faces,
     obstacle_at,
@@ -39,7 +41,9 @@ FLOOR_COLOUR, TABLE_COLOUR = (205, 205, 205), (196, 178, 150)
 OBSTACLE_COLOUR, SELECTED_COLOUR = (96, 132, 172), (240, 170, 60)
 TOUCHABLE_COLOUR = (150, 120, 170)
 START_COLOUR, GOAL_COLOUR, CONTACT_COLOUR = (150, 150, 165), (60, 190, 90), (230, 30, 30)
-OBSERVED_COLOUR, DECODED_COLOUR = (255, 140, 0), (150, 60, 200)
+DECODED_COLOUR, SWEPT_COLOUR = (150, 60, 200), (150, 190, 240)
+SWEPT_ARMS = 8
+POINT_SIZES = {"left_out": 0.004}  # m; 0.012 of others
 WANTED_COLOUR, FILTERED_COLOUR = (130, 130, 130), (20, 110, 230)
 TRACE_COLOUR = (235, 150, 40)
 NEAR, FAR = 0.05, 0.3  # m: link distances are red up to the first, and not drawn beyond the second
@@ -158,6 +162,7 @@ class _Place:
         self.scene = None  # what is drawn of it: scene, selected obstacle, time
         self.bodies = []  # of each: the body and its colour; its handle
         self.shapes = {}  # overlays by name
+        self.swept = []  # arms along a motion
 
 
 class Drawing:
@@ -169,13 +174,16 @@ class Drawing:
         cell: m, see `MESH_CELL`.
 
     Attributes:
-        show: set of what is drawn besides arm and scene: `start`, `goal`, `observed`, `decoded`,
-            `distances`, `correction`, `trace`.
+        show: set of what is drawn besides arm and scene, see `OPTIONS`. `left_out` are points of a
+            cloud that are no obstacles, `swept` are transparent arms along a recorded motion.
         selected: index of the obstacle drawn in another colour; None for none.
         on_click: function of an obstacle's index; None: obstacles cannot be clicked.
     """
 
-    OPTIONS = ("start", "goal", "observed", "decoded", "distances", "correction", "trace")
+    OPTIONS = (
+        *("start", "goal", "observed", "left_out", "decoded"),
+        *("distances", "correction", "trace", "swept"),
+    )
 
     def __init__(
         self, server: "viser.ViserServer", simulation: Simulation, cell: float = MESH_CELL
@@ -184,6 +192,8 @@ class Drawing:
         self._scene = server.scene
         self._cell = cell
         self.show = {"start", "goal", "correction"}
+        if simulation.episodes.left_out is not None:
+            self.show |= {"observed", "left_out"}
         self.selected: int | None = None
         self.on_click: Callable[[int], None] | None = None
         self._places: list[_Place] = []
@@ -312,7 +322,9 @@ class Drawing:
         robot = self.simulation.robot
         observed = _observed if self.simulation.query.scene.is_static else self._observed_now
         self._points(place, "observed", OBSERVED_COLOUR, arm, observed)
+        self._points(place, "left_out", LEFT_OUT_COLOUR, arm, self._left_out)
         self._points(place, "decoded", DECODED_COLOUR, arm, _decoded)
+        self._draw_swept(place, arm)
         self._lines(place, "distances", 0.004, lambda: _distance_lines(arm, self.simulation))
         self._lines(place, "correction", 0.012, lambda: _arrows(arm, robot), arrows=True)
         self._lines(place, "trace", 0.006, lambda: _trace(arm, robot))
@@ -322,6 +334,27 @@ class Drawing:
         """Of moving obstacles, with the arm where it is."""
         configuration = self.simulation.robot.denormalise(arm.state)
         return observed_points(SceneObservation.of(scene, configuration))
+
+    def _left_out(self, scene, arm):
+        left_out = self.simulation.episodes.left_out
+        return np.zeros((0, 3), np.float32) if left_out is None else left_out
+
+    def _draw_swept(self, place, arm):
+        """Transparent arms along the recorded motion, which change with the query."""
+        states = arm.recording if "swept" in self.show else None
+        if states is None:
+            for ghost in place.swept:
+                ghost.show(False)
+            return
+        robot = self.simulation.robot
+        for i in range(SWEPT_ARMS - len(place.swept)):
+            node = f"{place.name}/swept{i}"
+            ghost = ArmDrawing(self._scene, robot, node, COARSE_MESH_CELL, SWEPT_COLOUR, 0.2)
+            place.swept.append(ghost)
+        numbers = np.linspace(0, len(states) - 1, SWEPT_ARMS, dtype=int)
+        for ghost, state in zip(place.swept, states[numbers], strict=True):
+            ghost.show(True)
+            ghost.set(robot.denormalise(state))
 
     def _points(self, place, name, colour, arm, find):
         scene = self.simulation.query.scene.at(arm.time)
@@ -333,9 +366,11 @@ class Drawing:
         if drawn is scene:
             handle.visible = True
             return
-        points = find(scene, arm)
+        points, size = find(scene, arm), POINT_SIZES.get(name, 0.012)
+        if name == "observed" and isinstance(scene, ObservedScene):
+            size = 2 * scene.point_radius
         handle = self._scene.add_point_cloud(
-            f"{place.name}/{name}", points, colour, point_size=0.012, point_shape="circle"
+            f"{place.name}/{name}", points, colour, point_size=size, point_shape="circle"
         )
         place.shapes[name] = scene, handle
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from roboarm_nmp import envs
+from roboarm_nmp.datasets.cloud_flags import CloudFlags, observed_scene
 from roboarm_nmp.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.datasets.format import ORIGINAL, SPLITS, DatasetError, OutOfDateError
 from roboarm_nmp.datasets.problems import load_problems
@@ -17,6 +18,7 @@ from roboarm_nmp.envs.subgoals import subgoals
 from roboarm_nmp.motions.trajectories import load_trajectory
 
 MAX_SECONDS = 3600  # of a trajectory from a file
+MAX_TRIES = 1000  # configurations, for a query among points
 DEMO = "demo"
 """Instead of a policy's name: the task's demonstrations."""
 RANDOM = "random"
@@ -35,6 +37,7 @@ class Episodes:
             configurations (k, n), None without a recording.
         recording: what a recording is called; None where there are none.
         note: why the queries are random ones; empty otherwise.
+        left_out: m, (n, 3), points of a cloud that are no obstacles.
     """
 
     task: str
@@ -43,6 +46,7 @@ class Episodes:
     get: Callable[[str, int], tuple[Query, np.ndarray | None]]
     recording: str | None = None
     note: str = ""
+    left_out: np.ndarray | None = None
 
     def split(self, wanted: str) -> str:
         """The split of this name, or the only one that there is."""
@@ -153,6 +157,57 @@ def roadmap_episodes(folder: str | Path) -> Episodes:
 
     count = len(paths.offsets) - 1
     return Episodes(paths.task, ("roadmap path",), lambda split: count, get, "roadmap path")
+
+
+def cloud_episodes(
+    task: str, flags: CloudFlags, seed: int = 0, trajectory: Path | None = None
+) -> Episodes:
+    """The `Episodes` among the points of a cloud: random queries, or a file of a trajectory.
+
+    Args:
+        task: without obstacles of its own; it names the arm.
+        flags: with a cloud.
+        seed: of random queries.
+        trajectory: the file.
+
+    Raises ValueError: the task has obstacles, or a file cannot be used.
+    """
+    from roboarm_nmp.envs.collision.checker import CollisionChecker  # Numba takes a while
+
+    base = envs.get_task(task).scene
+    if not isinstance(base, Scene) or base.obstacles:
+        raise ValueError(
+            f"{task} has obstacles of its own: give --cloud with no_obstacles, or with "
+            "no_obstacles@FILE for another arm"
+        )
+    robot = base.robot
+    recorded = None
+    start = robot.contact_free
+    if trajectory is not None:
+        recorded = trajectory_episodes(task, trajectory)
+        start = recorded.get("scene", 0)[0].start
+    scene, left_out = observed_scene(flags, robot, np.asarray(start), find_left_out=True)
+    if recorded is not None:
+        query, states = recorded.get("scene", 0)
+        query = query._replace(scene=scene)
+        return replace(recorded, get=lambda split, number: (query, states), left_out=left_out)
+    env, checker = envs.make(scene), CollisionChecker(scene)
+
+    def get(split, number):
+        rng, ends = np.random.default_rng([seed, number]), []
+        for _ in range(MAX_TRIES):
+            configuration = env.sample_feasible(rng)
+            if checker.is_free(np.clip(robot.normalise(configuration), -1.0, 1.0)):
+                ends.append(configuration)
+            if len(ends) == 2:
+                return Query(ends[0], ends[1], scene), None
+        raise ValueError(
+            f"{flags.cloud}: the arm is free of its points almost nowhere: check --frame, --units "
+            "and --point-radius"
+        )
+
+    note = f"in the points of {flags.cloud}"
+    return Episodes(task, (RANDOM,), lambda split: None, get, note=note, left_out=left_out)
 
 
 def trajectory_episodes(task: str, path: str | Path, seed: int = 0) -> Episodes:

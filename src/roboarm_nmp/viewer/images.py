@@ -4,7 +4,8 @@
     frames = render_configurations(env, query, trajectory.configurations)
 
 The arm is white, and the goal position of the end effector is a green ball. Where the goal is a
-configuration, a transparent green ghost of the arm shows it. The command is `viewer.show`.
+configuration, a transparent green ghost of the arm shows it. Points of an `ObservedScene` are
+orange. The command is `viewer.show`.
 """
 
 import io
@@ -20,10 +21,16 @@ from PIL import Image
 
 from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.point_images import (
+    LEFT_OUT_COLOUR,
+    OBSERVED_COLOUR,
+    PointImage,
+    point_image,
+)
 from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.robots.rotations import matrix
-from roboarm_nmp.envs.scenes.primitives import Box, ConvexHull, Sphere
+from roboarm_nmp.envs.scenes.primitives import Box, ConvexHull, ObservedScene, Sphere
 from roboarm_nmp.envs.world import image_array
 from roboarm_nmp.utils.bullet import pybullet as p
 from roboarm_nmp.utils.files import write_atomically
@@ -47,6 +54,9 @@ LOWEST, HIGHEST = (-2.0, -2.0, -1.0), (2.0, 2.0, 2.0)
 SAME_DEPTH = 1e-4  # about a centimetre: where arm and ghost coincide, the arm is visible
 GHOST_COLOUR, GHOST_OPACITY = (0.25, 1.0, 0.4), 0.6
 ANIMATION_COLOURS = 128
+LEFT_OUT_RADIUS, TRACE_RADIUS = 0.002, 0.006  # m
+TRACE_COLOUR = (30, 90, 220)
+SWEPT_ARMS, SWEPT_OPACITY = 6, 0.3  # of an image of a motion
 BOX_CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))
 
 
@@ -101,16 +111,21 @@ def render_configurations(
     points: Sequence | np.ndarray = (),
     camera: tuple[float, float] | None = None,
     times: Iterable[float] | None = None,
+    left_out: np.ndarray | None = None,
+    swept: bool = False,
 ) -> Iterator[np.ndarray]:
     """Images as of `render_query`, from one point of view, with the arm in each configuration.
 
     Args:
         times: s, (k,), of each configuration, for moving obstacles; by default 0.
+        left_out: m, (n, 3), points that are drawn in grey.
+        swept: yield one image: the arm in the first configuration, transparent in some of the
+            others, and the path of its end effector (blue).
         configurations: (k, n), joint angles in rad, e.g. of a `Trajectory`.
         env, query, size, points, camera: see `render_query`.
 
     Yields:
-        k images, uint8 (height, width, 3).
+        k images, or one, uint8 (height, width, 3).
     """
     arm_env = env.unwrapped
     assert isinstance(arm_env, RoboArmEnv)
@@ -126,22 +141,58 @@ def render_configurations(
         [_extent(arm_env, poses, times), [goal_position], np.reshape(points, (-1, 3))]
     )
     view = _camera(arm_env, visible, size, camera)
-    ghost = None
+    clouds = []
+    if left_out is not None:
+        clouds.append((left_out, LEFT_OUT_RADIUS, LEFT_OUT_COLOUR))
+    if isinstance(query.scene, ObservedScene):
+        clouds.append((query.scene.points, query.scene.point_radius, OBSERVED_COLOUR))
+    cloud = _points_seen(clouds, view, size) if clouds else None
+    ghost = trace = None
+    others = []
+    if swept:
+        path = _path_points(robot, configurations), TRACE_RADIUS, TRACE_COLOUR
+        trace, others = _points_seen([path], view, size), configurations[1:]
+        configurations, times = configurations[:1], times[:1]
     for configuration, seconds in zip(configurations, times, strict=True):
         world.set_time(seconds)
         if has_ghost and (ghost is None or not query.scene.is_static):
             world.arm.set_configuration(query.goal)
             ghost = _shoot(arm_env, view, size)
         world.arm.set_configuration(configuration)
-        shot = _shoot(arm_env, view, size)
+        shot = _with_points(_shoot(arm_env, view, size), cloud)
+        for number in np.linspace(0, len(others) - 1, min(SWEPT_ARMS, len(others)), dtype=int):
+            world.arm.set_configuration(others[number])
+            colours = _with_ghost(shot, _shoot(arm_env, view, size), (1, 1, 1), SWEPT_OPACITY)
+            shot = shot._replace(colour=colours)
         pixels = shot.colour if ghost is None else _with_ghost(shot, ghost)
+        if trace is not None:  # over the transparent arms, which would pale it
+            pixels, _ = trace.over(pixels, shot.depth)
         yield np.asarray(Image.fromarray(pixels.astype(np.uint8)).reduce(OVERSAMPLING))
 
 
-def _with_ghost(shot: _Shot, ghost: _Shot) -> np.ndarray:
+def _path_points(robot, configurations) -> np.ndarray:
+    """Points (n, 3), m, along the end effector's path, no two of which are far apart."""
+    path = robot.forward_kinematics(np.asarray(configurations))
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    along = np.concatenate([[0.0], steps.cumsum()])
+    places = np.linspace(0.0, along[-1], 2 + int(along[-1] / TRACE_RADIUS))
+    return np.stack([np.interp(places, along, axis) for axis in path.T], axis=1)
+
+
+def _with_points(shot: _Shot, cloud: PointImage | None) -> _Shot:
+    """A shot with points in front of what they hide."""
+    if cloud is None:
+        return shot
+    colour, depth = cloud.over(shot.colour, shot.depth)
+    return shot._replace(colour=colour, depth=depth)
+
+
+def _with_ghost(
+    shot: _Shot, ghost: _Shot, colour=GHOST_COLOUR, opacity: float = GHOST_OPACITY
+) -> np.ndarray:
     """The colours of a shot, with the arm of another one as a transparent ghost."""
-    tinted = ghost.colour.mean(-1, keepdims=True) * GHOST_COLOUR
-    mixed = (1 - GHOST_OPACITY) * shot.colour + GHOST_OPACITY * tinted
+    tinted = ghost.colour.mean(-1, keepdims=True) * colour
+    mixed = (1 - opacity) * shot.colour + opacity * tinted
     in_front = ghost.arm & (ghost.depth < shot.depth - SAME_DEPTH)
     return np.where(in_front[..., None], mixed, shot.colour)
 
@@ -154,6 +205,9 @@ def _extent(env: RoboArmEnv, configurations, times) -> np.ndarray:
         solids.append(env.scene.table)
     lowest, highest = _around_base(env.robot, [LOWEST, HIGHEST])
     boxes = [np.clip(_box_around(solid), lowest, highest) for solid in solids]
+    if isinstance(env.scene, ObservedScene) and len(env.scene.points):
+        points = np.clip(env.scene.points, lowest, highest)
+        boxes.append(np.stack([points.min(0), points.max(0)]))
     for configuration in configurations:
         env.world.arm.set_configuration(configuration)
         for link in range(-1, p.getNumJoints(env.body, physicsClientId=env.client)):
@@ -220,16 +274,27 @@ def _hidden(env: RoboArmEnv, yaw: float) -> float:
     return round(sum(hit[0] not in (-1, env.body) for hit in hits) / len(hits), 1)
 
 
+def _matrices(camera: _Camera, size):
+    """PyBullet's view and projection matrix of a camera."""
+    view = p.computeViewMatrixFromYawPitchRoll(
+        camera.target.tolist(), camera.distance, camera.yaw, camera.pitch, 0, 2
+    )
+    return view, p.computeProjectionMatrixFOV(FIELD_OF_VIEW, size[0] / size[1], 0.1, 20.0)
+
+
+def _points_seen(clouds, camera: _Camera, size) -> PointImage:
+    """The points of clouds as of `point_image`, in the size of a shot."""
+    width, height = OVERSAMPLING * size[0], OVERSAMPLING * size[1]
+    return point_image(clouds, *_matrices(camera, size), (width, height))
+
+
 def _shoot(env: RoboArmEnv, camera: _Camera, size) -> _Shot:
     width, height = OVERSAMPLING * size[0], OVERSAMPLING * size[1]
     light = math.radians(camera.yaw - 10.0)  # from the right, behind the camera
     _, _, pixels, depth, bodies = p.getCameraImage(
         width,
         height,
-        p.computeViewMatrixFromYawPitchRoll(
-            camera.target.tolist(), camera.distance, camera.yaw, camera.pitch, 0, 2
-        ),
-        p.computeProjectionMatrixFOV(FIELD_OF_VIEW, width / height, 0.1, 20.0),
+        *_matrices(camera, size),
         lightDirection=(1.4 * math.cos(light), 1.4 * math.sin(light), 2.5),
         lightAmbientCoeff=0.7,
         lightSpecularCoeff=0.02,

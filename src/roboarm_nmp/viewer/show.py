@@ -8,11 +8,16 @@
     roboarm show wall --output above.png --camera -90 -90
     roboarm show wall --policy planner --save-trajectory episode.csv
     roboarm show wall --output episode.gif --trajectory episode.csv
+    roboarm show --cloud table.ply --trajectory path.csv --output path.png
     roboarm show --problems problems.h5 --query 3 --output image.png
 
 The arm is white. The green ball is the goal position of the end effector. Where the goal is a
 configuration, the arm at the goal is shown in transparent green; the goal type `ee` has no such
-configuration. An image shows the start. `roboarm view` shows the same in the browser.
+configuration. An image shows the start; the image of a trajectory also shows transparent arms along
+the motion, and the end effector's path (blue). `roboarm view` shows the same in the browser.
+
+With a point cloud, the points that `roboarm plan` avoids are orange balls, and the points that it
+leaves out are grey: points of the table, the floor and the arm, outliers, and points out of reach.
 """
 
 import contextlib
@@ -29,6 +34,7 @@ import tyro
 from PIL import Image
 
 from roboarm_nmp import envs
+from roboarm_nmp.datasets.cloud_flags import CloudFlags, check_without_cloud
 from roboarm_nmp.evaluation.rollout import rollout
 from roboarm_nmp.motions.trajectories import STEP_SECONDS, check_ending, save_trajectory
 from roboarm_nmp.policies.registry import find_policy, make_policy
@@ -40,21 +46,23 @@ from roboarm_nmp.utils.signals import end_with_one_line, error_line
 from roboarm_nmp.viewer.episodes import (
     DEMO,
     Episodes,
+    cloud_episodes,
     demonstration_episodes,
     problem_episodes,
     task_episodes,
     trajectory_episodes,
 )
-from roboarm_nmp.viewer.images import SIZE, render_configurations, render_query, save_animation
+from roboarm_nmp.viewer.images import SIZE, render_configurations, save_animation
 
 MAX_FRAMES = 60  # of an animation: at the default size, a file has about 0.3 MB
 PAUSE = 1.5  # s, at the end of an episode
 
 
-@dataclass
-class Args:
+@dataclass(kw_only=True)
+class Args(CloudFlags):
     task: tyro.conf.Positional[str | None] = None
-    """The task's name, or the path of a scene file (.yaml). Not needed with --problems."""
+    """The task's name, or the path of a scene file (.yaml). Not needed with --problems or
+    --cloud; another arm beside a cloud is no_obstacles@FILE."""
     problems: Path | None = None
     """A file or folder of problems, as of `roboarm import`; --query is the number of a problem."""
     output: Path | None = None
@@ -103,6 +111,12 @@ def _check(args: Args):
             raise ValueError(
                 "--problems goes with a policy, not with a trajectory or demonstrations"
             )
+    if args.cloud is not None:
+        args.task = "no_obstacles" if args.task is None else args.task
+        if args.problems is not None or args.policy == DEMO:
+            raise ValueError("--cloud goes with a trajectory or a policy: leave out the recording")
+    else:
+        check_without_cloud(args)
     if args.task is None:
         raise ValueError("name a task or a scene file, or give --problems FILE")
     envs.get_task(args.task)
@@ -132,6 +146,8 @@ def _check(args: Args):
 
 
 def _episodes(args: Args, task: str) -> Episodes:
+    if args.cloud is not None:
+        return cloud_episodes(task, args, args.seed, args.trajectory)
     if args.trajectory is not None:
         return trajectory_episodes(task, args.trajectory, args.seed)
     if args.problems is not None:
@@ -171,8 +187,19 @@ def _draw(args: Args, output: Path, episodes: Episodes, goal_type: str):
     with contextlib.closing(envs.make(episodes.task, goal_type=goal_type)) as env:
         numbers = range(args.query, last + 1)
         for number in progress_bar(numbers, "drawing", unit="image", transient=True):
-            query, _ = episodes.find(split, number)
-            images.append(render_query(env, query, args.size, camera=args.camera))
+            query, states = episodes.find(split, number)
+            configurations = [query.start]
+            if states is not None and args.trajectory is not None:
+                configurations = query.scene.robot.denormalise(states)
+            images += render_configurations(
+                env,
+                query,
+                configurations,
+                args.size,
+                camera=args.camera,
+                left_out=episodes.left_out,
+                swept=args.trajectory is not None,
+            )
     columns = math.ceil(math.sqrt(args.draws))
     width, height = args.size
     grid = Image.new(
@@ -212,6 +239,7 @@ def _animate(args: Args, episodes: Episodes, policy, arguments: dict):
                 args.size,
                 camera=args.camera,
                 times=[step * STEP_SECONDS for step in steps],
+                left_out=episodes.left_out,
             )
             frames = list(progress_bar(images, "drawing", len(steps), "frame", transient=True))
             seconds = [*np.diff(steps) * STEP_SECONDS, PAUSE]

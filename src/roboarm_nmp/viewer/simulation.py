@@ -107,7 +107,10 @@ class Arm:
             while the filter escapes from a local minimum or follows an approach path.
         correction: the filter's change of it, L2, normalised; None where `wanted` is None.
         escaping: whether the filter escapes, or follows an approach path, without the policy.
+        recording: the normalised configurations (k, n) that it replays; None where it does not.
     """
+
+    recording: np.ndarray | None = None
 
     def __init__(self, name: str):
         self.name = name
@@ -185,13 +188,12 @@ class RecordedArm(Arm):
     def __init__(self, name: str):
         super().__init__(name)
         self._world = World(drawn=False)
-        self._states: np.ndarray = np.zeros((0, 0))
 
     def begin(self, number: int, query: Query, states: np.ndarray | None = None):
         """Put it at the start of a recording, normalised configurations (k, n)."""
         assert states is not None
         self._clear()
-        self._states = states
+        self.recording = states
         self.state = states[0]
         self.trace = [states[0]]
         self.kinematic = True
@@ -203,15 +205,15 @@ class RecordedArm(Arm):
 
     def step(self):
         """Advance by one configuration."""
-        if self.ended:
+        if self.ended or self.recording is None:
             return
         self.steps += 1
-        self.state = self._states[self.steps]
+        self.state = self.recording[self.steps]
         self.trace.append(self.state)
         self._world.in_collision(self._world.robot.denormalise(self.state), self.time)
         self.contacts = contacts_in(self._world)
         self.contact_steps += self.in_contact
-        self.ended = self.success = self.steps == len(self._states) - 1
+        self.ended = self.success = self.steps == len(self.recording) - 1
 
     def close(self):
         """Disconnect from PyBullet."""
