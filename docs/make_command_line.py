@@ -87,6 +87,7 @@ SHARED = {
     "RunArgs": "Flags of the run",
     "EnvArgs": "Flags of the environment",
     "EncoderFlags": "Flags of the encoders",
+    "CloudFlags": "Flags of the point cloud",
 }  # base classes of the flags that several trainers have: class -> heading
 
 
