@@ -4,7 +4,7 @@ import dataclasses
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -106,7 +106,7 @@ def observed_scene(
     if flags.intrinsics is not None:
         intrinsics = numbers_in("--intrinsics", flags.intrinsics, 4).tolist()
     table, floor = (TABLE, FLOOR) if flags.table else (None, None)
-    options = {"table": table, "floor": floor}
+    options: dict[str, Any] = {"table": table, "floor": floor}
     for name in ("cell", "min_points", "arm_distance"):
         if getattr(flags, name) is not None:
             options[name] = getattr(flags, name)
@@ -132,7 +132,8 @@ def observed_scene(
     )
     if not find_left_out:
         return scene, np.zeros((0, 3), np.float32)
-    of_obstacles, _ = prepare_cloud(cloud, robot, recorded_at, **options | {"cell": 1e-4})
+    options["cell"] = 1e-4  # m: nearly nothing is thinned out
+    of_obstacles, _ = prepare_cloud(cloud, robot, recorded_at, **options)
     finite = cloud[np.isfinite(cloud).all(1)]
-    rows = [np.ascontiguousarray(part).view("V12").ravel() for part in (finite, of_obstacles)]
-    return scene, finite[~np.isin(*rows)]
+    one, other = (np.ascontiguousarray(part).view("V12").ravel() for part in (finite, of_obstacles))
+    return scene, finite[~np.isin(one, other)]
