@@ -193,7 +193,8 @@ def export(
     path = get_dataset_path(dataset_id)
     if path.exists() and not overwrite:
         raise ValueError(f"the dataset {dataset_id} exists ({path}); --overwrite replaces it")
-    planner = demos.parameters.get("options", {}).get("planner", "a planner")
+    planner = demos.parameters.get("options", {}).get("planner")
+    origin = "Recorded motions" if planner is None else f"Plans of {planner}"
     env = gymnasium.make(gymnasium_id, goal_type=goal_type, **arguments)
     arm_env = env.unwrapped
     assert isinstance(arm_env, RoboArmEnv)
@@ -215,8 +216,8 @@ def export(
             {
                 "dataset_id": dataset_id,
                 "minari_version": minari.__version__,
-                "algorithm_name": f"{planner} (OMPL), followed by a position controller",
-                "description": f"Verified motion-planning demonstrations for the task {demos.task} "
+                "algorithm_name": f"{origin}, followed by a position controller",
+                "description": f"Verified demonstrations for the task {demos.task} "
                 f"of RoboArm-NMP, goal type {goal_type}. Made by: {demos.made_by}",
             }
         )

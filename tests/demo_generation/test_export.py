@@ -64,11 +64,8 @@ def test_exact_actions_repeat_the_episode(demos):
     dataset_id, _ = export.export(demos, "ee", "replay/exact-v0", exact=True, progress=False)
     dataset = minari.load_dataset(dataset_id)
     env = dataset.recover_environment()
-    assert (dataset.action_space, dataset.observation_space) == (
-        env.action_space,
-        env.observation_space,
-    )
-    assert "RRTConnect" in dataset.storage.metadata["algorithm_name"]
+    assert dataset.action_space == env.action_space
+    assert "Plans of compiled" in dataset.storage.metadata["algorithm_name"]
     env = env.unwrapped
     assert env.scene == envs.TASKS["wall"].scene and env.goal_type == "ee"
     for demo, episode in zip(demos, dataset, strict=True):
