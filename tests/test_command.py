@@ -16,7 +16,7 @@ from roboarm_nmp import __main__ as command
 
 NAMES = [*(name for name in command.COMMANDS if name not in ("train", "robot")), "robot check"]
 NAMES += [f"train {name}" for name in command.TRAINERS]
-WITHOUT_GROUPS = ("robot check", "data", "policies")  # which have few flags
+WITHOUT_GROUPS = ("robot check", "data", "policies", "benchmark")  # which have few flags
 
 
 def run(*arguments):
@@ -28,7 +28,8 @@ def run(*arguments):
 @pytest.mark.parametrize("name", ["collect", "queries"])
 def test_planning_without_ompl_is_refused_in_one_line(name, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "ompl", None)
-    monkeypatch.delitem(sys.modules, "roboarm_nmp.planning.planner", raising=False)
+    for module in ("planner", "ompl_planners"):
+        monkeypatch.delitem(sys.modules, f"roboarm_nmp.planning.{module}", raising=False)
     monkeypatch.setattr(sys, "argv", sys.argv)
     assert command.main([name, "--task", "wall"]) == 1
     message = capsys.readouterr().err
