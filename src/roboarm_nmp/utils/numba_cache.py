@@ -64,7 +64,7 @@ def _announce_compilation(folder):
     with contextlib.suppress(OSError):
         _lock = open(Path(folder, "compiling"), "wb")  # noqa: SIM115
         fcntl.flock(_lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        write_line("compiling collision checks and kinematics (once, up to a minute)")
+        write_line("compiling collision checks and kinematics (once, one to two minutes)")
 
 
 class _CheckedResult(CompileResultCacheImpl):
