@@ -11,6 +11,7 @@ from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.datasets.recordings import Recording, fit_path, write_demonstrations
 from roboarm_nmp.demo_generation.verify import verify
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.viewer import show
 
 RANDOM = "random_boxes_easy"
 
@@ -42,6 +43,8 @@ def test_noisy_motions_at_50_hz_are_demonstrations_like_planned_ones(tmp_path):
         assert np.median(np.linalg.norm(ours.actions, axis=1)) > 0.025  # at full speed
     assert verify(path, progress=False)["good"] == 4
     assert len(load_demos_for(envs.make("wall"), [path], "wall")) == 4
+    image = ["--output", str(tmp_path / "a.png"), "--size", "64", "48"]
+    assert show.main(["wall", "--policy", "demo", "--demos", str(path), *image]) == 0
 
 
 def test_scenes_that_vary_are_those_of_the_recordings(tmp_path):

@@ -92,6 +92,8 @@ class Args(CloudFlags):
     network, a run's folder with a `policy.onnx` in it, or the name of a pretrained policy; `demo`
     replays the task's demonstrations, and --query is then the number of a demonstration; without
     one, `go-to-goal`, or the recorded motion alone"""
+    demos: Path | None = None
+    """with `--policy demo`: this file of demonstrations instead of the task's own"""
     trajectory: Path | None = None
     """play this file (.csv, .npz, .json, .yaml; docs/guide/trajectories.md) in the scene of
     --query"""
@@ -526,6 +528,8 @@ def new_obstacle(kind: str, robot: Robot) -> Box | Cylinder | Sphere:
 def _check(args: Args):
     """Raises ValueError for arguments that cannot be used, before any work."""
     flags.check(args)
+    if args.demos is not None and DEMO not in args.policy:
+        raise ValueError("--demos goes with --policy demo")
     if args.cloud is not None:
         args.task = args.task or "no_obstacles"
         if DEMO in args.policy:
@@ -595,7 +599,7 @@ def _simulation(args: Args) -> "Simulation":
     elif Path(args.task).is_dir():
         episodes = roadmap_episodes(args.task)
     elif DEMO in args.policy:
-        episodes = demonstration_episodes(args.task)
+        episodes = demonstration_episodes(args.task, args.demos)
     elif args.trajectory is not None:
         episodes = trajectory_episodes(args.task, args.trajectory, args.seed)
     else:

@@ -117,11 +117,15 @@ def _random_episodes(task: str, seed: int, note: str) -> Episodes:
     return Episodes(task, (RANDOM,), lambda split: None, get, note=note)
 
 
-def demonstration_episodes(task: str) -> Episodes:
-    """The `Episodes` of a task's demonstrations. Raises DatasetError: it has none."""
-    if not demo_path(task).exists():
-        raise DatasetError(f"{task} has no demonstrations: no file {demo_path(task)}")
-    demos = load_demos(task)
+def demonstration_episodes(task: str, file: Path | None = None) -> Episodes:
+    """The `Episodes` of demonstrations: of a file, by default the task's.
+
+    Raises DatasetError: there are none.
+    """
+    path = demo_path(task) if file is None else file
+    if not path.exists():
+        raise DatasetError(f"{task} has no demonstrations: no file {path}")
+    demos = load_demos(path, task)
 
     def get(split, number):
         demo = demos[number]

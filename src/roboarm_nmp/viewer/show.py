@@ -72,6 +72,8 @@ class Args(CloudFlags):
     `via-points`, `planner` (as in clean_rl_scripts/evaluate.py), a policy network, a run's folder
     with a `policy.onnx` in it, or the name of a pretrained policy (docs/benchmark/results.md).
     `demo` replays the task's demonstrations; --query is then the number of a demonstration."""
+    demos: Path | None = None
+    """With `--policy demo`: this file of demonstrations instead of the task's own."""
     goal_type: Literal["ee", "config", "combined", "pose"] | None = None
     """What the goal is; by default the policy's own, otherwise `combined`. For `ee`, the goal is a
     position: there is no ghost of the arm."""
@@ -105,6 +107,8 @@ def _check(args: Args):
     """Raises ValueError for arguments that cannot be used, before any work."""
     flags.check(args)
     is_recording = args.trajectory is not None or args.policy == DEMO
+    if args.demos is not None and args.policy != DEMO:
+        raise ValueError("--demos goes with --policy demo")
     if args.problems is not None:
         args.task = "no_obstacles" if args.task is None else args.task
         if is_recording:
@@ -153,7 +157,7 @@ def _episodes(args: Args, task: str) -> Episodes:
     if args.problems is not None:
         return problem_episodes(args.problems, task)
     if args.policy == DEMO:
-        return demonstration_episodes(task)
+        return demonstration_episodes(task, args.demos)
     return task_episodes(task, args.seed)
 
 
