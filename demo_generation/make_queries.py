@@ -16,10 +16,12 @@ have room in every scene.
 With `--limits datasheet`, starts and goals are inside the position limits of the arm's datasheet,
 where these are narrower than the URDF's. Others are left out. Plans of `--solvable` stay inside.
 
-Where obstacles move (`envs.scenes.moving_boxes`), each query has a scene of its own, and the file
-stores its seed. Queries whose start or goal is blocked when it has to be free are left out.
+Where obstacles move (`envs.scenes.moving_boxes`), each query has a scene of its own. Queries whose
+start or goal is blocked when it has to be free are left out. Of these scenes and of wide ones
+(`envs.scenes.wide_scenes`) the file stores seeds instead of obstacles.
 
-Where scenes vary, `--queries-per-scene` queries in a row share a scene, which makes smaller files.
+Where scenes vary, `--queries-per-scene` queries in a row share a scene, which makes smaller files;
+in wide scenes they share their start, too, unless no goal can be reached from it.
 
 Query i of a split depends only on the seed, the split and i, so the file is the same on every
 machine and for every number of workers. The file is written at the end, in one piece. Until then,
@@ -37,7 +39,7 @@ import numpy as np
 import tyro
 
 from roboarm_nmp import envs
-from roboarm_nmp.datasets.format import ORIGINAL, AnimatedScenes, scene_seeds
+from roboarm_nmp.datasets.format import ORIGINAL, SeededScenes, scene_seeds
 from roboarm_nmp.datasets.journal import Journal, journal_of
 from roboarm_nmp.datasets.problems import load_problems
 from roboarm_nmp.datasets.queries import query_path, write_queries
@@ -45,6 +47,7 @@ from roboarm_nmp.demo_generation.collect import MAX_QUERIES, demonstrate
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.moving_boxes import MovingScenes
 from roboarm_nmp.envs.scenes.primitives import Scene, from_lists, to_lists
+from roboarm_nmp.envs.scenes.wide_scenes.distribution import WideScenes
 from roboarm_nmp.envs.world import HOLD_DRIFT, SUBSTEPS, TIME_STEP
 from roboarm_nmp.planning.planner import Planner
 from roboarm_nmp.utils import flags, workers
@@ -58,7 +61,9 @@ from roboarm_nmp.utils.signals import end_with_one_line, error_line
 HOLD_STEPS = 24
 STREAMS = {"test": Stream.TEST_QUERIES, "validation": Stream.VALIDATION_QUERIES}
 SCENES = 1  # a fourth number, for the scenes of a split
+MAX_SCENES = 2**20  # wide ones of a split; more would be those of the next split
 SOLVE_ATTEMPTS, SOLVE_CHECKS = 3, 200_000
+SHARED_ATTEMPTS = 6  # queries to try from the start of a scene, before another one
 # Random configurations for a goal in a region: as many at a time, and at most for one goal.
 GOALS, MAX_GOALS = 1_000, 1_000_000
 
@@ -129,18 +134,27 @@ class Sampler:
         seed, split, number = job
         stream, robot = STREAMS[split], self.env.robot
         scene_number = number // self.queries_per_scene
-        self.env.sample_scene(np.random.default_rng([seed, stream, scene_number, SCENES]))
-        rng = np.random.default_rng([seed, stream, number])
+        scene_rng = np.random.default_rng([seed, stream, scene_number, SCENES])
+        scene_seed = None
+        if isinstance(self.env.scene_distribution, WideScenes):
+            scene_seed = wide_scene_seed(seed, split, scene_number)
+            scene_rng = np.random.default_rng(scene_seeds(scene_seed)[0])
+        self.env.sample_scene(scene_rng)
+        start_of_scene = None
+        if scene_seed is not None and self.queries_per_scene > 1:
+            start_of_scene = self.env.sample_end(scene_rng)
+        rng = motions_rng = np.random.default_rng([seed, stream, number])
         moving = self.env.is_animated
-        scene_seed, motions_rng = None, rng
         rejected = Counter()
-        for _ in range(MAX_QUERIES):
+        for attempt in range(MAX_QUERIES):
+            if attempt == SHARED_ATTEMPTS:
+                start_of_scene = None
             if moving:  # a scene for each query: its motions depend on start and goal
                 scene_seed = int(rng.integers(2**32))
                 seed_at_rest, seed_of_motions = scene_seeds(scene_seed)
                 self.env.sample_scene(np.random.default_rng(seed_at_rest))
                 motions_rng = np.random.default_rng(seed_of_motions)
-            start, goal = self._sample_query(rng)
+            start, goal = self._sample_query(rng, start_of_scene)
             ends = np.array([start, goal])
             if self.limits != "urdf" and not robot.is_within(ends, self.limits).all():
                 rejected["outside"] += 1
@@ -161,22 +175,24 @@ class Sampler:
                     "goal": goal.tolist(),
                     "rejected": rejected,
                 }
-                if moving:
+                if scene_seed is not None:
                     query["scene_seed"] = scene_seed
                 else:
                     query["obstacles"] = to_lists(self.env.scene.obstacles)
                 return query
         raise RuntimeError(f"{MAX_QUERIES} queries in a row were rejected: {dict(rejected)}")
 
-    def _sample_query(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    def _sample_query(
+        self, rng: np.random.Generator, start: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """As `env.sample_query`, with the goal's end effector in the goal region, if there is one.
 
         Raises RuntimeError: no goal in it was found.
         """
         if self.goal_region is None:
-            return self.env.sample_query(rng)
+            return self.env.sample_query(rng, start)
         robot = self.env.robot
-        start = self.env.sample_feasible(rng)
+        start = self.env.sample_feasible(rng) if start is None else start
         inside = 0
         low, high = np.reshape(self.goal_region, (3, 2)).T
         for _ in range(MAX_GOALS // GOALS):
@@ -193,6 +209,11 @@ class Sampler:
             f"({inside / MAX_GOALS:.2%}) have their end effector in this box, and 0 of these are "
             f"feasible goals"
         )
+
+
+def wide_scene_seed(seed: int, split: str, scene_number: int) -> int:
+    """The seed of a wide scene: those of a split are consecutive, which needs hardly any space."""
+    return ((2 * seed + list(STREAMS).index(split)) * MAX_SCENES + scene_number) % 2**32
 
 
 def make_queries(
@@ -269,9 +290,9 @@ def make_queries(
                 rejected.update(query["rejected"])
             start = np.array([query["start"] for query in made], np.float32)
             goal = np.array([query["goal"] for query in made], np.float32)
-            if isinstance(distribution, MovingScenes):
+            if isinstance(distribution, (MovingScenes, WideScenes)):
                 seeds = np.array([query["scene_seed"] for query in made], np.uint32)
-                splits[split] = (start, goal, AnimatedScenes(distribution, seeds, start, goal))
+                splits[split] = (start, goal, SeededScenes(distribution, seeds, start, goal))
             elif isinstance(distribution, Scene):
                 splits[split] = (start, goal)
             else:

@@ -10,14 +10,13 @@ import numpy as np
 
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.robots.inverse_kinematics import inverse_kinematics
-from roboarm_nmp.envs.scenes.containers import Place
+from roboarm_nmp.envs.scenes.places import Place, random_poses
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.planning.approach_path import approach_path
 
 MARGIN, NEAR = 0.003, 0.015  # m: of all configurations, and of most of them at most
 FAR_SHARE = 0.25  # of those farther than NEAR, so many are kept
 RETREATED = 0.5  # share of the configurations from which the arm has retreated
-TILT = 0.35  # standard deviation of the hand's direction from the place's approach, each axis
 POSES, NUM_SEEDS, MAX_ROUNDS = 32, 8, 10  # of inverse kinematics: poses a round, states a pose
 EVERY = 10  # steps of an approach path between configurations on the way
 
@@ -35,7 +34,7 @@ def place_configurations(
     robot, checker = scene.robot, CollisionChecker(scene)
     ends, on_ways = [], []
     for _ in range(MAX_ROUNDS):
-        poses = _poses(places, rng)
+        poses = random_poses(places, rng, POSES)
         seed = int(rng.integers(2**32))
         states = []
         for solutions in inverse_kinematics(robot, poses, seed, NUM_SEEDS, checker, MARGIN):
@@ -52,26 +51,3 @@ def place_configurations(
             break
     shape = (-1, robot.num_joints)
     return np.reshape(ends, shape), np.reshape(on_ways, shape)
-
-
-def _poses(places: Sequence[Place], rng: np.random.Generator) -> np.ndarray:
-    """Random end-effector poses (POSES, 7) in places."""
-    poses = np.empty((POSES, 7))
-    for pose in poses:
-        place = places[int(rng.integers(len(places)))]
-        x, y, z = rng.uniform(-0.5, 0.5, 3) * place.size
-        cos, sin = np.cos(place.yaw), np.sin(place.yaw)
-        pose[:3] = place.centre + [cos * x - sin * y, sin * x + cos * y, z]
-        axis = place.approach + TILT * rng.standard_normal(3)
-        pose[3:] = _hand_along(axis / np.linalg.norm(axis), rng.uniform(-np.pi, np.pi))
-    return poses
-
-
-def _hand_along(axis: np.ndarray, roll: float) -> np.ndarray:
-    """The quaternion (xyzw) that turns z to a unit vector, after a turn about z."""
-    x, y, z = axis
-    # From z to the axis by the shortest turn; from -z by half a turn about x.
-    turn = np.array([-y, x, 0.0, 1.0 + z]) if z > -1.0 + 1e-9 else np.array([1.0, 0.0, 0.0, 0.0])
-    a, b, _, w = turn / np.linalg.norm(turn)
-    sin, cos = np.sin(roll / 2), np.cos(roll / 2)
-    return np.array([a * cos + b * sin, b * cos - a * sin, w * sin, w * cos])

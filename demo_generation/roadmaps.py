@@ -45,6 +45,7 @@ from roboarm_nmp.demo_generation.place_configurations import place_configuration
 from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker
 from roboarm_nmp.envs.scenes.containers import Containers
 from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.scenes.wide_scenes.distribution import WideScenes
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.flags import CORES, PositiveFloat, PositiveInt, Seed, Workers
 from roboarm_nmp.utils.random_streams import Stream
@@ -538,7 +539,7 @@ def random_paths_of_scene(
     rng = np.random.default_rng([seed, Stream.ROADMAPS, index])
     scene = envs.get_task(task).scene
     ends = more_nodes = None
-    if isinstance(scene, Containers):
+    if isinstance(scene, (Containers, WideScenes)):
         scene, places = scene.sample_with_places(rng)
         ends, on_ways = place_configurations(scene, places, rng, _goal_count(paths_per_scene))
         more_nodes = _around(on_ways, rng)

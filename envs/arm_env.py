@@ -18,6 +18,7 @@ from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.robots.rotations import rotation_angle, signed
 from roboarm_nmp.envs.scenes.primitives import ObservedScene, Scene, is_number
+from roboarm_nmp.envs.scenes.wide_scenes.distribution import WideScene
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.world import HOLD_STEPS, MAX_EDGE, World, image_array, why_no_window
 from roboarm_nmp.utils.bullet import pybullet as p
@@ -319,16 +320,37 @@ class RoboArmEnv(gym.Env):
         self.world.check_free(**{name: configuration})
         return configuration
 
-    def sample_query(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """A start and a goal that is not reached from the outset: two float32 (n,), rad."""
-        start = self.sample_feasible(rng)
+    def sample_query(
+        self, rng: np.random.Generator, start: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """A start and a goal that is not reached from the outset: two float32 (n,), rad.
+
+        `start`: to sample a goal only.
+        """
+        if start is None:
+            start = self.sample_end(rng)
         while True:
-            goal = self.sample_feasible(rng)
+            goal = self.sample_end(rng)
             pair = np.stack([start, goal])
             end_effectors = self._goal_type.end_effector(self.robot, pair)
             achieved = self._goal_type.achieved(self.robot.normalise(pair), end_effectors)
             if not self._compare(*achieved)[1]:
                 return start, goal
+
+    def sample_end(self, rng: np.random.Generator) -> np.ndarray:
+        """A start or a goal: feasible joint angles, float32 (n,).
+
+        A random configuration; in wide scenes mostly a grasp (`envs.collision.query_ends`).
+        """
+        if not isinstance(self.scene, WideScene) or not self.scene.places:
+            return self.sample_feasible(rng)
+        # Here, because Numba takes a while to import.
+        from roboarm_nmp.envs.collision.query_ends import random_ends
+
+        while True:
+            [end] = random_ends(self.scene, self.scene.places, rng, 1)
+            if self.is_feasible(end):
+                return end
 
     # --- Episodes
 

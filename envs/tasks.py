@@ -27,6 +27,8 @@ from roboarm_nmp.envs.scenes.moving_boxes import (
 )
 from roboarm_nmp.envs.scenes.primitives import TABLE, Box, Cylinder, Scene
 from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
+from roboarm_nmp.envs.scenes.wide_scenes.distribution import WideScenes
+from roboarm_nmp.envs.scenes.wide_scenes.names import HELD_OUT
 from roboarm_nmp.utils.names import suggest
 
 SCENE_FILES = WORLD_FILES  # this project's and those of other programs
@@ -42,7 +44,7 @@ class Task:
         trainable: False for the tasks that are there to test generalisation (paper: "OOD").
     """
 
-    scene: Scene | RandomBoxes | MixedScenes | Containers | MovingScenes
+    scene: Scene | RandomBoxes | MixedScenes | Containers | WideScenes | MovingScenes
     summary: str
     trainable: bool = True
 
@@ -242,6 +244,14 @@ TASKS: dict[str, Task] = {
     "benchmaker_bookshelf_thin": Task(
         _bookshelf_thin(),
         "MotionBenchMaker's bookshelf_thin: six shelves, divided by a board",
+        trainable=False,
+    ),
+    "wide_scenes": Task(
+        WideScenes(), "fourteen families of places where arms work, from kitchens to scaffolds"
+    ),
+    "wide_scenes_held_out": Task(
+        WideScenes(HELD_OUT),
+        "four more: bottle racks, conveyors, pipes, rubble",
         trainable=False,
     ),
     "appearing_boxes": Task(

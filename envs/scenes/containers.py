@@ -14,6 +14,7 @@ import numpy as np
 
 from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.scenes.numbers import Vector
+from roboarm_nmp.envs.scenes.places import Place
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene
 from roboarm_nmp.envs.scenes.random_boxes import (
     FRICTION,
@@ -69,21 +70,6 @@ INSET = 0.015  # m between a place and the boards around it
 MOST = 32  # obstacles, the capacity of the encoder `oracle`
 
 
-@dataclass(frozen=True, eq=False)
-class Place:
-    """A region for the end effector.
-
-    Attributes:
-        centre, size: m, (3,), of a box with the yaw `yaw` (rad).
-        approach: unit vector (3,), in the world: the direction in which a hand enters.
-    """
-
-    centre: np.ndarray
-    size: np.ndarray
-    yaw: float
-    approach: np.ndarray
-
-
 @dataclass(frozen=True)
 class Containers:
     """One or two of open boxes (one half), shelves and tables (a quarter each) around the robot.
@@ -120,7 +106,7 @@ class Containers:
             turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
             for centre, size, approach in regions:
                 centre = scale * (turn @ centre + [*origin, 0.0])
-                places.append(Place(centre, scale * np.array(size), yaw, turn @ approach))
+                places.append(Place(centre, scale * np.array(size), turn, turn @ approach))
             azimuth += rng.uniform(math.pi * 2 / 3, math.pi * 4 / 3)
             count -= 1
         return replace(self.base, obstacles=tuple(obstacles)), places

@@ -115,9 +115,7 @@ def test_place_configurations_are_near_surfaces_with_the_hand_in_a_place():
         for state in ends:
             at = PANDA.forward_kinematics(PANDA.denormalise(state))
             for place in places:
-                x, y, z = at - place.centre
-                cos, sin = np.cos(place.yaw), np.sin(place.yaw)
-                local = np.array([cos * x + sin * y, cos * y - sin * x, z])
+                local = (at - place.centre) @ place.rotation
                 inside += (np.abs(local) <= place.size / 2 + 2e-4).all()
     assert inside >= 5  # the others have retreated
 

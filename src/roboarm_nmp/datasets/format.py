@@ -14,7 +14,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h5py
 import numpy as np
@@ -22,6 +22,7 @@ import numpy as np
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.motions import motion_from_numbers
+from roboarm_nmp.envs.scenes.moving_boxes import MovingScenes
 from roboarm_nmp.envs.scenes.primitives import (
     MAX_LENGTH,
     ROW,
@@ -38,6 +39,7 @@ from roboarm_nmp.envs.scenes.primitives import (
     with_may_touch,
     with_motion,
 )
+from roboarm_nmp.envs.scenes.wide_scenes.distribution import WideScenes
 from roboarm_nmp.envs.tasks import (
     TASKS,
     TRAINING_SCENES,
@@ -48,9 +50,6 @@ from roboarm_nmp.envs.tasks import (
     task_name,
 )
 from roboarm_nmp.utils.files import write_atomically
-
-if TYPE_CHECKING:
-    from roboarm_nmp.envs.scenes.moving_boxes import MovingScenes
 
 SPLITS = ("test", "validation")
 ORIGINAL = "original"  # split of queries that were not sampled; few tasks have it
@@ -73,7 +72,7 @@ OPTIONAL_SCENE_ARRAYS = (
     {"may_touch": ("<u1", None, "may_touch")},  # where obstacles have it
     {"motion_count": ("<u4", None, "obstacles"), "motions": ("<f8", None, "motions")},
 )
-SEED_ARRAYS = {"scene_seed": ("<u4", None, "start")}  # where obstacles move
+SEED_ARRAYS = {"scene_seed": ("<u4", None, "start")}  # where scenes are drawn from seeds
 QUERY_ARRAYS = {
     "start": ("<f4", JOINTS, "start"),
     "goal": ("<f4", JOINTS, "start"),
@@ -117,7 +116,10 @@ def array_formats(schema: str, names: Any) -> dict[str, tuple]:
     formats = {}
     for split in (*SPLITS, ORIGINAL):
         if split in SPLITS or f"{split}/start" in names:
-            formats.update(_with_scenes(QUERY_ARRAYS, "start", names, f"{split}/"))
+            arrays = dict(QUERY_ARRAYS)
+            if f"{split}/scene_seed" in names and f"{split}/goal_position" not in names:
+                del arrays["goal_position"]  # which follows from the goal
+            formats.update(_with_scenes(arrays, "start", names, f"{split}/"))
     return formats
 
 
@@ -199,16 +201,17 @@ class QueryScenes:
 
 
 @dataclass(frozen=True, eq=False)
-class AnimatedScenes:
-    """The scenes of n queries with moving obstacles: drawn from a seed each, on access.
+class SeededScenes:
+    """The scenes of n queries, drawn from a seed each, on access.
 
     Attributes:
-        distribution: the scenes' distribution, for a robot with j joints.
+        distribution: the scenes' distribution, for a robot with j joints; with `animate`, the
+            obstacles move.
         seeds: uint32 (n,).
         start, goal: float32 (n, j), rad, of the queries.
     """
 
-    distribution: "MovingScenes"
+    distribution: MovingScenes | WideScenes
     seeds: np.ndarray
     start: np.ndarray
     goal: np.ndarray
@@ -221,12 +224,14 @@ class AnimatedScenes:
     def __getitem__(self, i: int) -> Scene:
         at_rest, motions = scene_seeds(self.seeds[i])
         scene = self.distribution.sample(np.random.default_rng(at_rest))
+        if not isinstance(self.distribution, MovingScenes):
+            return scene
         rng = np.random.default_rng(motions)
         return self.distribution.animate(scene, self.start[i], self.goal[i], rng)
 
-    def take(self, chosen: slice | np.ndarray) -> "AnimatedScenes":
+    def take(self, chosen: slice | np.ndarray) -> "SeededScenes":
         """As `QueryScenes.take`."""
-        return AnimatedScenes(
+        return SeededScenes(
             self.distribution, self.seeds[chosen], self.start[chosen], self.goal[chosen]
         )
 
@@ -240,17 +245,17 @@ class AnimatedScenes:
 
 
 def scene_seeds(seed: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """The seeds of a scene at rest, and of its motions, from a seed of `AnimatedScenes`."""
+    """The seeds of a scene at rest, and of its motions, from a seed of `SeededScenes`."""
     return (int(seed), 0), (int(seed), 1)
 
 
 def scene_arrays(
-    path: str | Path, scenes: Iterable[Scene] | AnimatedScenes | None, base: Scene, prefix: str = ""
+    path: str | Path, scenes: Iterable[Scene] | SeededScenes | None, base: Scene, prefix: str = ""
 ) -> dict[str, np.ndarray]:
     """Arrays for a sequence of `Scene`s, equal ones stored once; none for None."""
     if scenes is None:
         return {}
-    if isinstance(scenes, AnimatedScenes):
+    if isinstance(scenes, SeededScenes):
         return {f"{prefix}scene_seed": scenes.seeds}
     number_of = {}  # scene -> its number, in the order of their first use
     index = [number_of.setdefault(scene, len(number_of)) for scene in scenes]

@@ -18,10 +18,10 @@ from roboarm_nmp.datasets.format import (
     ORIGINAL,
     QUERY_SCHEMA,
     SPLITS,
-    AnimatedScenes,
     DatasetError,
     OutOfDateError,
     QueryScenes,
+    SeededScenes,
     array_formats,
     check_configurations,
     check_format,
@@ -35,6 +35,7 @@ from roboarm_nmp.datasets.format import (
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.moving_boxes import MovingScenes
 from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.scenes.wide_scenes.distribution import WideScenes
 from roboarm_nmp.envs.tasks import get_task
 from roboarm_nmp.envs.world import HOLD_STEPS, World
 from roboarm_nmp.utils.names import suggest
@@ -66,7 +67,7 @@ class Queries:
         start: float32 (n, j), rad, of the j joints of the robot, `scenes.base.robot`.
         goal: float32 (n, j), rad.
         goal_position: float32 (n, 3), end-effector position at the goal, m.
-        scenes: `QueryScenes` or `AnimatedScenes`; `scenes[i]` is that of query i.
+        scenes: `QueryScenes` or `SeededScenes`; `scenes[i]` is that of query i.
     """
 
     task: str
@@ -75,7 +76,7 @@ class Queries:
     start: np.ndarray
     goal: np.ndarray
     goal_position: np.ndarray
-    scenes: QueryScenes | AnimatedScenes
+    scenes: QueryScenes | SeededScenes
 
     def __len__(self) -> int:
         return len(self.start)
@@ -154,7 +155,7 @@ def write_queries(
         seed: the seed the queries were made with.
         splits: `{"test": (start, goal, scenes), "validation": (start, goal, scenes)}`, and
             `original` where there are some; start and goal float32 (n, j), rad; scenes a sequence
-            of n `Scene`s, left out where all of them are the task's, or `AnimatedScenes`.
+            of n `Scene`s, left out where all of them are the task's, or `SeededScenes`.
         made_by: the command line that makes this file.
         parameters: JSON-ready dict of everything else that determined the queries.
 
@@ -173,10 +174,11 @@ def write_queries(
         arrays.update(scene_arrays(path, scenes, base, f"{split}/"))
         arrays[f"{split}/start"] = start
         arrays[f"{split}/goal"] = goal
-        if goal.ndim == 2 and goal.shape[1] == base.robot.num_joints:
+        is_wide = isinstance(scenes, SeededScenes) and isinstance(scenes.distribution, WideScenes)
+        if goal.ndim == 2 and goal.shape[1] == base.robot.num_joints and not is_wide:
             position = base.robot.forward_kinematics(goal).astype(np.float32)
             arrays[f"{split}/goal_position"] = position
-        if split == "test" and isinstance(scenes, AnimatedScenes):
+        if split == "test" and isinstance(scenes, SeededScenes):
             parameters = {**parameters, "first_scene": scenes.summary()}
     check_format(path, array_formats(QUERY_SCHEMA, arrays), arrays, base.robot)
     _check_queries(path, arrays, base.robot)
@@ -213,36 +215,39 @@ def _read_queries(path, task):
     for split in _splits_in(arrays):
         start, goal = arrays[f"{split}/start"], arrays[f"{split}/goal"]
         if f"{split}/scene_seed" in arrays:
-            distribution = _moving_scenes(path, task or attributes["task"])
-            scenes = AnimatedScenes(distribution, arrays[f"{split}/scene_seed"], start, goal)
+            distribution = _drawn_scenes(path, task or attributes["task"])
+            scenes = SeededScenes(distribution, arrays[f"{split}/scene_seed"], start, goal)
         else:
             scenes = read_scenes(path, base, arrays, f"{split}/")
+        position = arrays.get(f"{split}/goal_position")
+        if position is None:
+            position = base.robot.forward_kinematics(goal)
         queries[split] = Queries(
             task=attributes["task"],
             split=split,
             seed=attributes["seed"],
             start=start,
             goal=goal,
-            goal_position=arrays[f"{split}/goal_position"],
+            goal_position=position.astype(np.float32),
             scenes=scenes,
         )
     parameters = json.loads(attributes["parameters"])
     scenes = queries["test"].scenes
-    if isinstance(scenes, AnimatedScenes) and not np.allclose(
+    if isinstance(scenes, SeededScenes) and not np.allclose(
         scenes.summary(), parameters.get("first_scene", np.nan), rtol=0.0, atol=1e-6
     ):
         raise OutOfDateError(
-            f"{path}: out of date: made for another version of the moving scenes of "
+            f"{path}: out of date: made for another version of the scenes of "
             f"{attributes['task']!r}; make it again with: {attributes['made_by']} --overwrite"
         )
     return queries, parameters
 
 
-def _moving_scenes(path, task):
-    """The distribution of a task's scenes. Raises DatasetError: their obstacles do not move."""
+def _drawn_scenes(path, task):
+    """The distribution of a task's scenes. Raises DatasetError: they are not drawn from seeds."""
     distribution = get_task(task).scene
-    if not isinstance(distribution, MovingScenes):
-        raise DatasetError(f"{path}: has seeds of moving scenes, and the task {task!r} has none")
+    if not isinstance(distribution, (MovingScenes, WideScenes)):
+        raise DatasetError(f"{path}: has seeds of scenes, and the task {task!r} has none")
     return distribution
 
 
@@ -261,7 +266,8 @@ def _check_queries(path, arrays, robot: Robot):
     for split in _splits_in(arrays):
         for name in ("start", "goal"):
             check_configurations(path, f"{split}/{name}", arrays[f"{split}/{name}"], robot)
-        if not np.isfinite(arrays[f"{split}/goal_position"]).all():
+        position = arrays.get(f"{split}/goal_position", np.zeros(3))
+        if not np.isfinite(position).all():
             raise DatasetError(f"{path}: {split}/goal_position has numbers that are not finite")
     test = query_keys(arrays["test/start"], arrays["test/goal"])
     validation = query_keys(arrays["validation/start"], arrays["validation/goal"])

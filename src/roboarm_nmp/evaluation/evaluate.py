@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from roboarm_nmp import envs
-from roboarm_nmp.datasets.format import AnimatedScenes, QueryScenes
+from roboarm_nmp.datasets.format import QueryScenes, SeededScenes
 from roboarm_nmp.datasets.problem_formats import Problem
 from roboarm_nmp.datasets.problems import load_problems
 from roboarm_nmp.datasets.queries import Query, load_queries, validate
@@ -280,7 +280,7 @@ def wilson_interval(successes: float, n: int) -> tuple[float, float]:
 # --- Arguments
 
 
-Scenes = Sequence[Scene] | QueryScenes | AnimatedScenes
+Scenes = Sequence[Scene] | QueryScenes | SeededScenes
 
 
 @dataclass(frozen=True)

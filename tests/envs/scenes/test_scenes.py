@@ -162,8 +162,7 @@ def test_containers_have_places_between_their_parts_and_are_clear_of_the_robot()
             kinds.add(tuple(np.round(place.approach[2:], 1)))
             assert np.linalg.norm(place.approach) == pytest.approx(1.0) and min(place.size) > 0.0
             corners = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3), -1).reshape(-1, 3) * place.size
-            turn = p.getQuaternionFromEuler((0.0, 0.0, place.yaw))
-            points = [p.multiplyTransforms(place.centre, turn, x, (0, 0, 0, 1))[0] for x in corners]
+            points = place.centre + corners @ place.rotation.T
             for board in boards:
                 to_board = p.invertTransform(board.position, board.orientation)
                 local = [p.multiplyTransforms(*to_board, x, (0, 0, 0, 1))[0] for x in points]
