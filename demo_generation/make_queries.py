@@ -119,6 +119,7 @@ class Sampler:
         self.goal_region = goal_region
         self.limits: Limits = limits
         self.env = envs.make(task)
+        self._wide_scene: tuple[int | None, np.ndarray | None] = None, None
         self.planner = None
         if solvable:
             self.planner = Planner(self.env, max_checks=SOLVE_CHECKS, limits=limits)
@@ -134,15 +135,13 @@ class Sampler:
         seed, split, number = job
         stream, robot = STREAMS[split], self.env.robot
         scene_number = number // self.queries_per_scene
-        scene_rng = np.random.default_rng([seed, stream, scene_number, SCENES])
-        scene_seed = None
+        scene_seed = start_of_scene = None
         if isinstance(self.env.scene_distribution, WideScenes):
             scene_seed = wide_scene_seed(seed, split, scene_number)
-            scene_rng = np.random.default_rng(scene_seeds(scene_seed)[0])
-        self.env.sample_scene(scene_rng)
-        start_of_scene = None
-        if scene_seed is not None and self.queries_per_scene > 1:
-            start_of_scene = self.env.sample_end(scene_rng)
+            start_of_scene = self._draw_wide_scene(scene_seed)
+        else:
+            scene_rng = np.random.default_rng([seed, stream, scene_number, SCENES])
+            self.env.sample_scene(scene_rng)
         rng = motions_rng = np.random.default_rng([seed, stream, number])
         moving = self.env.is_animated
         rejected = Counter()
@@ -181,6 +180,15 @@ class Sampler:
                     query["obstacles"] = to_lists(self.env.scene.obstacles)
                 return query
         raise RuntimeError(f"{MAX_QUERIES} queries in a row were rejected: {dict(rejected)}")
+
+    def _draw_wide_scene(self, scene_seed: int) -> np.ndarray | None:
+        """Change to a scene, unless it is this one; returns the start its queries share, if so."""
+        if scene_seed != self._wide_scene[0]:
+            rng = np.random.default_rng(scene_seeds(scene_seed)[0])
+            self.env.sample_scene(rng)
+            is_shared = self.queries_per_scene > 1
+            self._wide_scene = scene_seed, self.env.sample_end(rng) if is_shared else None
+        return self._wide_scene[1]
 
     def _sample_query(
         self, rng: np.random.Generator, start: np.ndarray | None

@@ -243,15 +243,13 @@ class Site:
         flip = np.diag([1.0, -1.0 if mirrored else 1.0, 1.0])
         linear = rotation @ flip
         obstacles: list[Obstacle] = []
-        for part in self.parts:
+        turns = quaternions(linear @ np.array([part.rotation for part in self.parts]) @ flip)
+        for part, quaternion in zip(self.parts, map(_floats, turns), strict=True):
             centre = _floats(scale * linear @ part.centre + offset)
-            turn = linear @ part.rotation @ flip
             lengths = scale * part.lengths
             if part.kind is Sphere:
                 obstacles.append(Sphere(centre, float(lengths[0])))
-                continue
-            quaternion = _floats(quaternions(turn))
-            if part.kind is Box:
+            elif part.kind is Box:
                 obstacles.append(Box(centre, _floats(lengths), quaternion))
             elif part.kind is Cylinder:
                 obstacles.append(Cylinder(centre, *_floats(lengths), quaternion))
