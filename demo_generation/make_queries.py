@@ -7,7 +7,7 @@
 
 With `--solvable`, a query is accepted only if the planner solves it. That means: one of
 `SOLVE_ATTEMPTS` plans, of at most `SOLVE_CHECKS` collision checks each, reaches the goal in the
-simulator without contact.
+simulator without contact. With `--plannable` one plan has to be found, which is not followed.
 
 With `--goal-region`, the end effector of every goal is in a box. The goals are random feasible
 configurations as always, of which those elsewhere are left out. In scenes that vary, the box must
@@ -29,6 +29,7 @@ queries are written to a journal beside it. After an interruption, the same comm
 """
 
 import contextlib
+import math
 import sys
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -49,7 +50,7 @@ from roboarm_nmp.envs.scenes.moving_boxes import MovingScenes
 from roboarm_nmp.envs.scenes.primitives import Scene, from_lists, to_lists
 from roboarm_nmp.envs.scenes.wide_scenes.distribution import WideScenes
 from roboarm_nmp.envs.world import HOLD_DRIFT, SUBSTEPS, TIME_STEP
-from roboarm_nmp.planning.planner import Planner
+from roboarm_nmp.planning.planner import Planner, PlanningError
 from roboarm_nmp.utils import flags, workers
 from roboarm_nmp.utils.files import check_writable
 from roboarm_nmp.utils.flags import CORES, PositiveInt, Seed, Workers
@@ -78,6 +79,8 @@ class Args:
     """Names of tasks, or paths of scene files, with another arm as TASK@FILE; or `all`."""
     solvable: bool = False
     """Accept only queries that the planner solves."""
+    plannable: bool = False
+    """Accept only queries for which the planner finds a path; much faster than `--solvable`."""
     queries_per_scene: PositiveInt = 1
     """Queries in each scene, where scenes vary."""
     goal_region: Region = ()
@@ -114,6 +117,7 @@ class Sampler:
         queries_per_scene: int = 1,
         goal_region: tuple[float, ...] | None = None,
         limits: Limits = "urdf",
+        plannable: bool = False,
     ):
         self.queries_per_scene = queries_per_scene
         self.goal_region = goal_region
@@ -121,7 +125,8 @@ class Sampler:
         self.env = envs.make(task)
         self._wide_scene: tuple[int | None, np.ndarray | None] = None, None
         self.planner = None
-        if solvable:
+        self.follows_plans = solvable
+        if solvable or plannable:
             self.planner = Planner(self.env, max_checks=SOLVE_CHECKS, limits=limits)
 
     def __call__(self, job: tuple[int, str, int]) -> dict:
@@ -163,9 +168,10 @@ class Sampler:
                 continue
             if moving:
                 self.env.set_scene(self.env.scene_at_rest)
-            if not all(self.env.is_feasible(end, HOLD_STEPS) for end in (start, goal)):
+            held = (goal,) if start is start_of_scene else (start, goal)
+            if not all(self.env.is_feasible(end, HOLD_STEPS) for end in held):
                 rejected["unheld"] += 1
-            elif self.planner and not demonstrate(self.planner, start, goal, rng, SOLVE_ATTEMPTS):
+            elif self.planner and not self._is_solved(self.planner, start, goal, rng):
                 rejected["unsolved"] += 1
             else:
                 query = {
@@ -181,13 +187,26 @@ class Sampler:
                 return query
         raise RuntimeError(f"{MAX_QUERIES} queries in a row were rejected: {dict(rejected)}")
 
+    def _is_solved(self, planner: Planner, start, goal, rng: np.random.Generator) -> bool:
+        if self.follows_plans:
+            return demonstrate(planner, start, goal, rng, SOLVE_ATTEMPTS) is not None
+        try:
+            planner.plan(start, goal, seed=int(rng.integers(1, 2**32)), time_limit=math.inf)
+        except PlanningError:
+            return False
+        return True
+
     def _draw_wide_scene(self, scene_seed: int) -> np.ndarray | None:
         """Change to a scene, unless it is this one; returns the start its queries share, if so."""
         if scene_seed != self._wide_scene[0]:
             rng = np.random.default_rng(scene_seeds(scene_seed)[0])
             self.env.sample_scene(rng)
-            is_shared = self.queries_per_scene > 1
-            self._wide_scene = scene_seed, self.env.sample_end(rng) if is_shared else None
+            start = None
+            while self.queries_per_scene > 1 and start is None:
+                start = self.env.sample_end(rng)
+                if not self.env.is_feasible(start, HOLD_STEPS):
+                    start = None
+            self._wide_scene = scene_seed, start
         return self._wide_scene[1]
 
     def _sample_query(
@@ -237,12 +256,14 @@ def make_queries(
     progress: bool = True,
     goal_region: tuple[float, ...] | None = None,
     limits: Limits = "urdf",
+    plannable: bool = False,
 ) -> Counter:
     """Sample the queries of a task and write its file.
 
     Args:
         task: name of the task, path of a scene file, or `TASK@ROBOT`.
         solvable: accept only queries that the planner solves.
+        plannable: accept only queries for which the planner finds a path.
         queries_per_scene: queries in a row that have the same scene, where scenes vary.
         original: path of a file or folder of problems for the split `original`.
         goal_region: (xmin, xmax, ymin, ymax, zmin, zmax), m, of the goals' end-effector positions
@@ -274,6 +295,8 @@ def make_queries(
     }
     if limits != "urdf":
         options["limits"] = limits
+    if plannable:
+        options["plannable"] = True
     with contextlib.closing(Journal(journal_of(path), options)) as journal:
         jobs = [(seed, "test", number) for number in range(num_test)]
         jobs += [(seed, "validation", number) for number in range(num_validation)]
@@ -285,7 +308,7 @@ def make_queries(
             unit="query",
             disable=not progress,
         )
-        arguments = (task, solvable, queries_per_scene, goal_region, limits)
+        arguments = (task, solvable, queries_per_scene, goal_region, limits, plannable)
         results = workers.run(Sampler, arguments, missing, num_workers, warn=write_line)
         with bar, contextlib.closing(results):
             for query in results:
@@ -318,9 +341,12 @@ def make_queries(
         made_by += f"--num-test {num_test} --num-validation {num_validation}"
         if solvable:
             made_by += " --solvable"
+            parameters["solve_attempts"] = SOLVE_ATTEMPTS
+        if plannable:
+            made_by += " --plannable"
+        if solvable or plannable:
             parameters["unsolved"] = rejected["unsolved"]
             parameters["solve_checks"] = SOLVE_CHECKS
-            parameters["solve_attempts"] = SOLVE_ATTEMPTS
         if queries_per_scene > 1:
             made_by += f" --queries-per-scene {queries_per_scene}"
         if goal_region is not None:
@@ -370,11 +396,11 @@ def _check(args: Args) -> list[tuple[str, Path]]:
     pairs = [(task, args.output or query_path(task)) for task in tasks]
     for task, path in pairs:
         if isinstance(envs.get_task(task).scene, MovingScenes) and (
-            args.solvable or args.queries_per_scene > 1
+            args.solvable or args.plannable or args.queries_per_scene > 1
         ):
             raise ValueError(
-                f"--solvable and --queries-per-scene are not for {task}: its obstacles move, "
-                "for each query in a way of their own"
+                f"--solvable, --plannable and --queries-per-scene are not for {task}: its "
+                "obstacles move, for each query in a way of their own"
             )
         envs.get_task(task).base_scene.robot.position_limits(args.limits)  # or it raises
         query_path(task)  # rejects an unknown task, also with --output
@@ -400,9 +426,10 @@ def main(args: Args):
                 args.workers,
                 goal_region=args.goal_region or None,
                 limits=args.limits,
+                plannable=args.plannable,
             )
             text = f"{path}: written; {rejected['unheld']} samples rejected by the long hold check"
-            if args.solvable:
+            if args.solvable or args.plannable:
                 unsolved = rejected["unsolved"]
                 share = unsolved / (args.num_test + args.num_validation + unsolved)
                 text += f", {unsolved} not solved by the planner ({share:.3f})"

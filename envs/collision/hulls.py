@@ -319,20 +319,24 @@ def world_shapes(obstacles: Sequence, robot: Robot) -> tuple[np.ndarray, tuple[n
     return rows, (chain, bodies, pairs, vertices, cells)
 
 
+@functools.cache
+def _client_of_hulls():
+    """A world for `_hull`: to connect takes longer than the hull. It stays open."""
+    return p.connect(p.DIRECT)
+
+
 @functools.lru_cache(maxsize=1024)
 def _hull(vertices):
     """A `ConvexHull` as PyBullet makes it: centre (3,), vertices (v, 3) relative to it, `_cells`.
 
     PyBullet is asked for the vertices: it rounds them to about 1/10,000 of the hull's size.
     """
-    client = p.connect(p.DIRECT)
-    try:
-        shape = p.createCollisionShape(p.GEOM_MESH, vertices=vertices, physicsClientId=client)
-        body = p.createMultiBody(0.0, shape, physicsClientId=client)
-        flags = p.MESH_DATA_SIMULATION_MESH
-        mesh = np.array(p.getMeshData(body, -1, flags=flags, physicsClientId=client)[1])
-    finally:
-        p.disconnect(physicsClientId=client)
+    client = _client_of_hulls()
+    shape = p.createCollisionShape(p.GEOM_MESH, vertices=vertices, physicsClientId=client)
+    body = p.createMultiBody(0.0, shape, physicsClientId=client)
+    flags = p.MESH_DATA_SIMULATION_MESH
+    mesh = np.array(p.getMeshData(body, -1, flags=flags, physicsClientId=client)[1])
+    p.removeBody(body, physicsClientId=client)
     centre = (mesh.min(0) + mesh.max(0)) / 2
     return centre, mesh - centre, _cells([mesh - centre])
 

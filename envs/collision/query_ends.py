@@ -1,5 +1,6 @@
 """Starts and goals as people have them: grasps in a scene's places, pre-grasps, free poses."""
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -28,7 +29,7 @@ def random_ends(
 
     Raises RuntimeError: the scene leaves no room for the arm.
     """
-    checker = CollisionChecker(scene)
+    checker = _checker(scene)
     ends = []
     for kind in rng.random(number):
         end = None
@@ -36,6 +37,11 @@ def random_ends(
             end = _in_place(checker, places, rng, kind < GRASPS)
         ends.append(_anywhere(checker, rng) if end is None else end)
     return np.array(ends, np.float32)
+
+
+@functools.lru_cache(maxsize=1)
+def _checker(scene: Scene) -> CollisionChecker:
+    return CollisionChecker(scene)
 
 
 def _in_place(
