@@ -93,6 +93,8 @@ class Args:
     replan: bool = False
     """whenever the policy is stuck, follow a plan for 90 steps, as `replanning` does, among the
     obstacles of the geometry source; the safety filter then makes no escapes"""
+    search: bool = False
+    """of a policy that draws paths: search for one where none of its own can be verified"""
     lookahead: flags.NonNegativeFloat = 0.0
     """s: the safety filter takes distances as they will be after this time, if obstacles continue
     to approach as they do now"""

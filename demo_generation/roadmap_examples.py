@@ -1,4 +1,4 @@
-"""Examples of motions to a goal, from roadmap paths: what a policy observes, and its labels.
+"""Examples from roadmap paths: of motions to a goal, or whole paths, with what is observed.
 
     examples = RoadmapExamples("random_boxes_hard", None, encoder, find_checker, seed=1)
     examples(0)                     # of a new scene, whose roadmap is made first
@@ -26,7 +26,9 @@ import numpy as np
 from roboarm_nmp.datasets.episodes import observed
 from roboarm_nmp.datasets.roadmap_paths import RoadmapPaths
 from roboarm_nmp.demo_generation.roadmaps import random_paths_of_scene
+from roboarm_nmp.envs.collision.distance_field import DistanceField
 from roboarm_nmp.envs.perception.encoders import SceneEncoder
+from roboarm_nmp.envs.perception.point_clouds import observed_points
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.utils.random_streams import Stream
 
@@ -35,6 +37,56 @@ PER_PATH = 4  # examples of each chosen path, which share the link distances at 
 MORE_SCENES = 2**20  # more than a training has
 
 Examples = dict[str, np.ndarray]
+
+
+def _scene_with_paths(task, paths, seed, number, rng):
+    """Scene `number` and its paths: of `paths`, or a new one of the task if that is None."""
+    if paths is not None:
+        return paths.random_scene(rng)
+    # In a scene without room for the arm there may be no path.
+    for index in itertools.count(number, MORE_SCENES):
+        scene, found = random_paths_of_scene(index, task, seed)
+        if found:
+            return scene, found
+
+
+@dataclass
+class WholePaths:
+    """Makes whole paths of one scene after the other, with what is observed of the scene.
+
+    Attributes:
+        task, paths, encoder, seed: as of `RoadmapExamples`. The field is of observed points.
+        points: k, at equal distances along each path.
+        count: paths of each scene; with fewer, some are repeated.
+    """
+
+    task: str
+    paths: RoadmapPaths | None
+    encoder: SceneEncoder
+    seed: int
+    points: int
+    count: int = 256
+
+    def __call__(self, number: int) -> dict[str, np.ndarray]:
+        """`scene` (z,), `field`, of `DistanceField`, and `path` float32 (count, k, j)."""
+        rng = np.random.default_rng([self.seed, Stream.ROADMAP_EXAMPLES, number])
+        scene, paths = _scene_with_paths(self.task, self.paths, self.seed, number, rng)
+        chosen = rng.permutation(len(paths))
+        if len(paths) < self.count:
+            chosen = np.concatenate([chosen, rng.integers(len(paths), size=self.count)])
+        return {
+            "scene": self.encoder(scene),
+            "field": DistanceField(scene.robot).of_scene(observed_points(scene), scene),
+            "path": np.stack([resampled(paths[i], self.points) for i in chosen[: self.count]]),
+        }
+
+
+def resampled(path: np.ndarray, points: int) -> np.ndarray:
+    """`points` points at equal distances along a path (n, j): float32 (points, j)."""
+    steps = np.linalg.norm(np.diff(path.astype(np.float64), axis=0), axis=1)
+    travelled = np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum()
+    shares = np.linspace(0.0, 1.0, points)
+    return np.stack([np.interp(shares, travelled, joint) for joint in path.T], 1, dtype=np.float32)
 
 
 @dataclass
@@ -66,14 +118,7 @@ class RoadmapExamples:
     def __call__(self, number: int) -> tuple[np.ndarray, Examples]:
         """A scene's code, float32 (z,), and its examples. Each `number` >= 0 has its own."""
         rng = np.random.default_rng([self.seed, Stream.ROADMAP_EXAMPLES, number])
-        if self.paths is None:
-            # In a scene without room for the arm there may be no path.
-            for index in itertools.count(number, MORE_SCENES):
-                scene, paths = random_paths_of_scene(index, self.task, self.seed)
-                if paths:
-                    break
-        else:
-            scene, paths = self.paths.random_scene(rng)
+        scene, paths = _scene_with_paths(self.task, self.paths, self.seed, number, rng)
         return self.encoder(scene), self._draw(scene, paths, rng)
 
     def _draw(self, scene: Scene, paths: list[np.ndarray], rng: np.random.Generator) -> Examples:

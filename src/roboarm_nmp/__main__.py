@@ -17,6 +17,7 @@ TRAINERS = {
     "td3": ("clean_rl_scripts.td3_her_mp", "TD3 with HER and demonstrations"),
     "bc": ("bc_script.bc", "behavioural cloning of demonstrations"),
     "roadmap-bc": ("bc_script.roadmap_bc", "imitation of roadmap paths: policies for new scenes"),
+    "flow": ("bc_script.flow", "flow matching of whole paths, verified before the arm moves"),
     "vae": ("scene_embedding_train.vae", "scene encoder: VAE of camera images"),
     "vqvae": ("scene_embedding_train.vqvae", "scene encoder: VQ-VAE of camera images"),
     "pointnet2": ("scene_embedding_train.pointnet2", "scene encoder: PointNet++ of point clouds"),

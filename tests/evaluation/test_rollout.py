@@ -64,7 +64,7 @@ def test_start_at_the_goal_and_a_policy_that_gives_up_make_no_step(env):
 def test_replay_renders_what_the_rollout_went_through():
     env = envs.make("wall", horizon=20, render_mode="rgb_array", render_size=(64, 48))
     query = load_queries("wall", "validation")[1]
-    act, plan_found = make_policy("random", env, seed=3)(0, query)
+    act, plan_found, _ = make_policy("random", env, seed=3)(0, query)
     assert plan_found is None
     images = []
 

@@ -20,6 +20,7 @@ PATHS = {
     "td3_her_mp": ROOT / "clean_rl_scripts" / "td3_her_mp.py",
     "bc": ROOT / "bc_script" / "bc.py",
     "roadmap_bc": ROOT / "bc_script" / "roadmap_bc.py",
+    "flow": ROOT / "bc_script" / "flow.py",
 }
 # Trainers of policies in fixed scenes.
 TRAINERS = ("sac_her_mp", "td3_her_mp", "bc")
@@ -35,6 +36,9 @@ TINY_ROADMAP_BC = (
 )
 TINY_ROADMAP_BC += " --pool-scenes 4 --examples-per-scene 50 --updates-per-scene 10 --workers 0"
 TINY_ROADMAP_BC += " --total-updates 40 --eval-every 20 --eval-queries 2 --test-queries 1"
+TINY_FLOW = "--hidden-size 16 --token-width 16 --num-blocks 1 --batch-size 16 --first-scenes 2"
+TINY_FLOW += " --pool-scenes 4 --num-points 8 --updates-per-scene 10 --workers 0"
+TINY_FLOW += " --total-updates 40 --eval-every 20 --eval-queries 2 --test-queries 1"
 # For tests of what training leaves in the checkpoint: one evaluation, on one query.
 ONE_EVALUATION = ["--eval-every", "600", "--eval-queries", "1", "--test-queries", "0"]
 
@@ -74,8 +78,8 @@ def panda_env(goal_type="ee"):
 
 def command(trainer, folder, *flags):
     """A run of seconds; later flags win."""
-    tiny = {"bc": TINY_BC, "roadmap_bc": TINY_ROADMAP_BC}.get(trainer, TINY).split()
-    return [sys.executable, str(PATHS[trainer]), "--runs-dir", str(folder), *tiny, *flags]
+    tiny = {"bc": TINY_BC, "roadmap_bc": TINY_ROADMAP_BC, "flow": TINY_FLOW}.get(trainer, TINY)
+    return [sys.executable, str(PATHS[trainer]), "--runs-dir", str(folder), *tiny.split(), *flags]
 
 
 def run_script(trainer, folder, *flags):

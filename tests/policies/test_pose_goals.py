@@ -156,7 +156,7 @@ def test_baseline_reaches_goal_poses(policy):
     env = envs.make("wall", goal_type="pose")
     begin, reached = make_policy(policy, env), 0
     for number, query in enumerate(load_queries("wall", "validation")[:3]):
-        act, plan_found = begin(number, query)
+        act, plan_found, _ = begin(number, query)
         trajectory = rollout(env, query, act)
         reached += trajectory.success
         if policy == "planner":

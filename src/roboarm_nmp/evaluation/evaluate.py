@@ -40,6 +40,7 @@ from roboarm_nmp.evaluation.rollout import REAL_TIME, render_steps, rollout
 from roboarm_nmp.motions.metrics import motion_metrics, path_length, smoothness
 from roboarm_nmp.motions.trajectories import Trajectory
 from roboarm_nmp.policies.baselines import (
+    BASELINES,
     CHECKING,
     OMPL_PLANNERS,
     PLANNERS,
@@ -98,6 +99,8 @@ class EvaluationOptions:
             that the policy includes, if any; False for none.
         replan: whenever the policy is stuck, follow a plan for a while
             (`policies.replanning.ReplanWhenStuck`), among the geometry source's obstacles.
+        search: a policy that draws paths searches for one where it can verify none
+            (`policies.generative`).
         observe_every: steps from one observation of the scene to the next; None: static scenes are
             observed once (`envs.wrappers.ObservedSceneWrapper`).
         sensor_noise: a `envs.perception.noise.SensorNoise`; None for none.
@@ -128,6 +131,7 @@ class EvaluationOptions:
     geometry_source: str | None = None
     safety_filter: SafetyFilter | Literal[False] | None = None
     replan: bool = False
+    search: bool = False
     observe_every: int | None = None
     sensor_noise: SensorNoise | None = None
     action_delay: int = 0
@@ -191,7 +195,9 @@ def evaluate(
           `action_delay` (steps, or `real_time`), `versions`;
         - `geometry_source`: where obstacles were taken from, None if from nowhere; `privileged`:
           whether policy, filter or observations received the ground-truth obstacles;
-        - `replan`, `observe_every`, `sensor_noise` (a dict), where they were given.
+        - of a policy that draws paths, `verified_rate`, and with `search` the `search_rate`: the
+          shares of queries with a verified path, and of those for which one was searched for;
+        - `replan`, `search`, `observe_every`, `sensor_noise` (a dict), where they were given.
 
     Raises:
         EvaluationError: the policy, the task or the queries cannot be used.
@@ -320,6 +326,7 @@ class _Job:
             geometry_source=options.geometry_source or GROUND_TRUTH,
             safety_filter=options.safety_filter or False,
             replan=options.replan,
+            search=options.search,
         )
         return env, begin
 
@@ -534,7 +541,7 @@ class _Worker:
     def _outcome(self, index, query):
         self.env.reset_specific(*query)  # it refuses an invalid query before planning
         began = time.perf_counter()
-        act, plan_found = self.begin(index, query)
+        act, plan_found, searched = self.begin(index, query)
         planning_seconds = time.perf_counter() - began
         policy = None if act is None else _Counted(act, self.job.record)
         trajectory = rollout(self.env, query, policy, self.job.delay, planning_seconds)
@@ -544,7 +551,8 @@ class _Worker:
             "actions": 0 if policy is None else policy.actions,
             "policy_seconds": seconds,
             "planning_seconds": planning_seconds,
-            "plan_found": bool(plan_found),
+            "plan_found": plan_found,
+            "searched": searched,
         }
         if self.job.record:
             outcome["episode"] = RecordedEpisode(
@@ -685,6 +693,12 @@ def _summary(job: _Job, outcomes: list[Outcome]) -> dict[str, Any]:
         result["sensor_noise"] = options.sensor_noise.to_metadata()
     if options.replan:
         result["replan"] = True
+    if policy not in BASELINES and outcomes[0]["plan_found"] is not None:
+        result["verified_rate"] = sum(outcome["plan_found"] for outcome in outcomes) / count
+        result["planning_seconds"] = _mean(outcomes, "planning_seconds")
+    if options.search:
+        result["search"] = True
+        result["search_rate"] = sum(outcome["searched"] for outcome in outcomes) / count
     return result
 
 

@@ -49,8 +49,13 @@ def report(result: dict[str, Any]) -> str:
             continue
         number = "-" if value is None else f"{value:.4g}"
         lines.append(f"  {label:<24}{number:>9}  {unit}")
-    if result["free_motion_rate"] is not None:
-        lines.append(f"  {'free motion':<24}{result['free_motion_rate']:>9.4f}  ")
+    for label, name in (
+        ("free motion", "free_motion_rate"),
+        ("path verified", "verified_rate"),
+        ("  ... by search", "search_rate"),
+    ):
+        if result.get(name) is not None:
+            lines.append(f"  {label:<24}{result[name]:>9.4f}  ")
     return "\n".join(lines)
 
 
@@ -74,6 +79,7 @@ def _settings(result):
         "privileged": "yes" if result["privileged"] else None,
         "safety filter": _safety_filter(result["safety_filter"]),
         "replans": "when stuck" if result.get("replan") else None,
+        "searches": "where no path is verified" if result.get("search") else None,
         "observed every": f"{observe_every} steps" if observe_every else None,
         "sensor noise": ", ".join(f"{name} {value:g}" for name, value in noise.items()) or None,
         "time limit": None if limit is None else f"{limit:g} s per query",

@@ -18,10 +18,12 @@ class EpisodePolicy(NamedTuple):
 
     act: act(observation) -> action (n,); None: the policy gives up.
     plan_found: whether it found a motion; None if it does not look for one.
+    searched: whether it searched for that motion where a network's paths did not do.
     """
 
     act: Policy | None
     plan_found: bool | None = None
+    searched: bool = False
 
 
 BeginEpisode = Callable[[int, Query], EpisodePolicy]

@@ -3,7 +3,7 @@
     policy, arguments = find_policy("via-points")        # or a file, a folder, a pretrained name
     env = roboarm_nmp.make("wall", **arguments)
     begin = make_policy(policy, env)
-    act, plan_found = begin(0, load_queries("wall")[0])  # once, at the start of an episode
+    act, *_ = begin(0, load_queries("wall")[0])          # once, at the start of an episode
     action = act(observation)                            # at every step
 
 A safety filter may be put around any policy (`policies.safety_filter`); a trained policy may
@@ -183,6 +183,7 @@ def make_policy(
     geometry_source: str | Path = "ground_truth",
     safety_filter: "SafetyFilter | Literal[False] | None" = None,
     replan: bool = False,
+    search: bool = False,
 ) -> BeginEpisode:
     """A policy in an environment: a function (query's number, `Query`) -> `EpisodePolicy`.
 
@@ -206,6 +207,8 @@ def make_policy(
             `link_distances`, whose geometry source is the filter's.
         replan: whenever the policy is stuck, follow a plan for a while
             (`policies.replanning.ReplanWhenStuck`); a safety filter then makes no escapes.
+        search: a policy that draws paths searches for one where it can verify none
+            (`policies.generative`).
 
     Raises:
         PolicyError: the policy cannot act in this environment.
@@ -221,7 +224,7 @@ def make_policy(
         except ValueError as error:
             raise PolicyError(str(error)) from error
     else:
-        begin, as_observed = _trained(policy, env)
+        begin, as_observed = _trained(policy, env, seed, search)
     if safety_filter is None:
         safety_filter = own_safety_filter(policy)
     if replan:
@@ -241,11 +244,11 @@ def _filtered(begin, env, seed, safety_filter):
         raise PolicyError(str(error)) from error
 
     def begin_filtered(number, query):
-        act, plan_found = begin(number, query)
-        if act is not None:
-            rng = np.random.default_rng([seed, number])
-            act = safety_filter.filter_policy(act, env, rng)
-        return EpisodePolicy(act, plan_found)
+        begun = begin(number, query)
+        if begun.act is None:
+            return begun
+        rng = np.random.default_rng([seed, number])
+        return begun._replace(act=safety_filter.filter_policy(begun.act, env, rng))
 
     return begin_filtered
 
@@ -265,11 +268,12 @@ def _replanned(begin, env, seed, geometry_source):
     begin_replanning = make_replanning(env, seed, source)
 
     def begin_replanned(number, query):
-        act, plan_found = begin(number, query)
+        begun = begin(number, query)
         replanning = begin_replanning(number, query)
-        if act is not None and replanning is not None:
-            act = ReplanWhenStuck(act, replanning, env.robot.normalise(query.goal))
-        return EpisodePolicy(act, plan_found)
+        if begun.act is None or replanning is None:
+            return begun
+        goal = env.robot.normalise(query.goal)
+        return begun._replace(act=ReplanWhenStuck(begun.act, replanning, goal))
 
     return begin_replanned
 
@@ -280,7 +284,7 @@ def _translated(begin, goals):
     def begin_translated(number, query):
         if not goals.begin(query):
             return EpisodePolicy(None, plan_found=False)
-        act, plan_found = begin(number, query)
+        act, plan_found, _ = begin(number, query)
         return EpisodePolicy(lambda observation: act(goals(observation)), plan_found)
 
     return begin_translated
@@ -318,7 +322,7 @@ def _load(path: str | Path) -> _TrainedPolicy:
     return _TrainedPolicy(network, arguments, safety_filter, size)
 
 
-def _trained(path, env):
+def _trained(path, env, seed, search):
     """`make_policy` of a policy network, and its `ConfigurationGoals`, None if it needs none."""
     network, trained, _, size = _load(path)
     robot = env.unwrapped.robot
@@ -329,6 +333,17 @@ def _trained(path, env):
     mode = trained.get("action_mode", "relative")
     if mode != env.action_mode:
         raise PolicyError(f"{path}: its actions are of mode {mode!r}, not {env.action_mode!r}")
+
+    if "paths" in network.metadata:
+        # Here, because Numba takes a while to import.
+        from roboarm_nmp.policies.generative import Generative
+
+        try:
+            return Generative(network, env, seed, search), None
+        except NetworkError as error:
+            raise PolicyError(f"{path}: {error}") from error
+    if search:
+        raise PolicyError(f"{path}: search is for policies that draw paths")
 
     # One observation at a time: in a batch its last bits would depend on the batch's size, for a
     # gain of a tenth of the time at most.

@@ -339,7 +339,7 @@ class PolicyArm(Arm):
         query = query._replace(start=np.clip(query.start, robot.lower, robot.upper))
         try:
             self.env.reset_specific(*query)  # before planning, as `evaluate` does
-            act, plan_found = self._begin(self._number, query)
+            act, plan_found, _ = self._begin(self._number, query)
             self._episode = Episode(self.env, query)
         except ValueError as error:
             self.problem = str(error)

@@ -1,0 +1,332 @@
+"""Policies that draw whole paths from a network, verify them, and follow the best one.
+
+    begin = Generative(network, env, seed=0)       # `registry.make_policy` makes it
+    act, verified, searched = begin(number, query)
+
+The network turns noise into paths, step by step (`bc_script/flow.py`). A path is the straight line
+from start to goal, plus curves with drawn coefficients. Each draw is repaired by gradient steps
+away from observed points (`envs.collision.distance_field`), and checked in the observed cloud
+(`envs.collision.checker`). The shortest path that keeps the first of `MARGINS` is shortened and
+followed. Where no draw does, paths are drawn again from the best ones with new noise, then
+assembled from parts of all draws, then smaller margins do; last, where that is allowed, a path is
+searched for. Otherwise the arm follows the draw with the fewest contacts.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from roboarm_nmp.datasets.queries import Query
+from roboarm_nmp.envs.arm_env import RoboArmEnv
+from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker, Rules
+from roboarm_nmp.envs.collision.distance_field import DistanceField
+from roboarm_nmp.envs.perception.encoders import make_encoder
+from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
+from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, observed_points
+from roboarm_nmp.networks.network_file import Network
+from roboarm_nmp.networks.untrusted import NetworkError
+from roboarm_nmp.policies.baselines import follow_path
+from roboarm_nmp.policies.policy import EpisodePolicy
+from roboarm_nmp.policies.pose_goals import observed_at_start
+
+# The numbers below were chosen on validation queries: docs/algorithms/flow.md.
+DRAWS, ROUNDS = 32, 3  # paths per round, rounds
+FIRST = 8  # of a round, those that lack the least distance are repaired and checked first
+STEPS, STEPS_AGAIN = 4, 3  # of the flow; from half-way on
+MARGINS = (0.01, 0.003, 0.0)  # m
+MARGIN_GROWTH = 0.05  # m per unit of normalised distance, near a start or goal with less room
+REPAIRS, REPAIR_DISTANCE, REPAIR_RATE, MOST_REPAIR = 20, 0.04, 0.3, 0.06
+MOST_KNOTS = 1_000  # of a path in a file
+MOST_CHECKED = 40  # times that motions of assembled paths are checked
+CHORDS = 40  # straight motions that are tried to shorten the chosen path
+SEARCH_CHECKS = 20_000  # of a search, in each margin
+
+
+class Generative:
+    """A policy for each episode of an environment: a function (number, `Query`) -> `EpisodePolicy`.
+
+    Args:
+        network: a policy network that draws paths: its metadata have `paths`.
+        env: the `RoboArmEnv`.
+        seed: of the noise, >= 0; each query has its own generator.
+        search: whether a path is searched for where no draw can be verified.
+    """
+
+    def __init__(self, network: Network, env: RoboArmEnv, seed: int = 0, search: bool = False):
+        self._robot = env.robot
+        self._env = env
+        self._seed = seed
+        self._search = search
+        self._field = DistanceField(self._robot)
+        self._source = find_geometry_source(POINT_CLOUD, self._robot)
+        self._network = network
+        self._paths = PathsOfNetwork(network, self._field)
+
+    def __call__(self, number: int, query: Query) -> EpisodePolicy:
+        scene = observed_at_start(self._env, query)
+        rng = np.random.default_rng([self._seed, number])
+        ends = np.clip(self._robot.normalise([query.start, query.goal]), -1.0, 1.0)
+        draw = self._paths.begin(scene, *ends.astype(np.float32))
+        path, verified, searched = find_path(draw, self._source(scene), ends, rng, self._search)
+        path = self._robot.denormalise(path)
+        return EpisodePolicy(follow_path(path, self._robot), verified, searched)
+
+
+class PathsOfNetwork:
+    """Draws paths with a network, of one query after the other.
+
+    Args:
+        network: see `Generative`.
+        field: a `DistanceField` of the robot.
+    """
+
+    def __init__(self, network: Network, field: DistanceField):
+        self._network = network
+        self._field = field
+        self.curves, self._every, self._line = _form_of_paths(network, field)
+        share = np.linspace(0.0, 1.0, self.curves.shape[1], dtype=np.float32)
+        self._share = share[:, None]  # of the straight line
+        self._encoder = make_encoder(POINT_CLOUD, network.inputs["scene"][1] // 3)
+
+    def begin(self, scene, start, goal):
+        """Begin a query: observe a `Scene`; start and goal are float32 (n,), normalised."""
+        self.start, self.goal = start, goal
+        self.points = observed_points(scene)
+        self._grid = self._field.of_scene(self.points, scene)[None]
+        states = start + (goal - start) * np.linspace(0.0, 1.0, self._line)[:, None]
+        self._query = {
+            "start": start,
+            "goal": goal,
+            "scene": self._encoder(scene),
+            "line_centres": self._field.centres(states),
+        }
+        distances, uphill = self._field.distances(states, self._grid)
+        self._query |= {"line_distances": distances, "line_uphill": uphill}
+        return self
+
+    def knots(self, x):
+        """The paths (m, k, n) of coefficients (m, c, n)."""
+        bends = np.einsum("ck,mcn->mkn", self.curves, x)
+        path = self.start * (1.0 - self._share) + self.goal * self._share + bends
+        return np.clip(path, -1.0, 1.0)
+
+    def draw(self, number, rng):
+        """Coefficients of new paths: (m, c, n)."""
+        noise = rng.standard_normal((number, len(self.curves), len(self.start)), np.float32)
+        return self._flow(noise, 0.0, STEPS)
+
+    def draw_again(self, x, rng):
+        """Coefficients of paths like those of x: half noise, and again through the flow."""
+        noise = rng.standard_normal(x.shape, np.float32)
+        return self._flow(0.5 * noise + 0.5 * x, 0.5, STEPS_AGAIN)
+
+    def _flow(self, x, begin, steps):
+        number = len(x)
+        query = {
+            name: np.repeat(np.asarray(one, np.float32)[None], number, axis=0)
+            for name, one in self._query.items()
+        }
+        times = np.linspace(begin, 1.0, steps + 1)
+        for now, then in zip(times[:-1], times[1:], strict=True):
+            distances, uphill = self._along(self.knots(x)[:, self._every : -1 : self._every])
+            path: np.ndarray = self._network(
+                noisy=x.reshape(number, -1),
+                time=np.full((number, 1), now, np.float32),
+                distances=distances,
+                uphill=uphill,
+                **query,
+            ).reshape(x.shape)
+            x = x + (path - x) * np.float32((then - now) / (1.0 - now))
+        return x
+
+    def _along(self, paths, hinge=None):
+        states = paths.reshape(-1, paths.shape[-1])
+        options = {} if hinge is None else {"hinge": hinge}
+        found = self._field.distances(states, self._grid, **options)
+        return [one.reshape(*paths.shape[:2], -1) for one in found]
+
+    def repaired(self, x):
+        """Coefficients after gradient steps of the paths away from points."""
+        x = x.copy()
+        smooth = 1.0 / np.arange(1, len(self.curves) + 1, dtype=np.float32)[:, None]
+        scale = (self.curves**2).sum(1)[:, None]
+        for _ in range(REPAIRS):
+            _, uphill = self._along(self.knots(x)[:, 1:-1:2], REPAIR_DISTANCE)
+            step = np.einsum("ck,mkn->mcn", self.curves[:, 1:-1:2], uphill)
+            step *= 2.0 * REPAIR_RATE * smooth / scale
+            moves = np.abs(np.einsum("ck,mcn->mkn", self.curves[:, ::2], step)).max((1, 2))
+            x += step * np.minimum(1.0, MOST_REPAIR / np.maximum(moves, 1e-6))[:, None, None]
+        return x
+
+    def lacking(self, x):
+        """What the paths of coefficients (m, c, n) lack in distance, summed: (m,)."""
+        distances, _ = self._along(self.knots(x)[:, 1:-1])
+        return np.maximum(REPAIR_DISTANCE / 2.0 - distances, 0.0).sum((1, 2))
+
+
+def _form_of_paths(network, field):
+    """`curves` (c, k) and the two numbers of `path_metadata`. Raises NetworkError."""
+    form = network.metadata["paths"]
+    try:
+        curves = np.array(form["curves"], np.float32)
+        every, line = int(form["features_every"]), int(form["line"])
+        knots = len(range(every, curves.shape[1] - 1, every))
+        joints, spheres = field.num_joints, field.num_spheres
+        sizes = {
+            "noisy": (curves.shape[0] * joints,),
+            "time": (1,),
+            "distances": (knots, spheres),
+            "uphill": (knots, joints),
+            "start": (joints,),
+            "goal": (joints,),
+            "line_centres": (line, spheres, 3),
+            "line_distances": (line, spheres),
+            "line_uphill": (line, joints),
+        }
+        points = network.inputs["scene"][1]
+        fits = np.isfinite(curves).all() and points is not None and points % 3 == 0
+        fits = fits and curves.shape[1] <= MOST_KNOTS
+        fits = fits and all(network.inputs[name][1:] == size for name, size in sizes.items())
+    except (KeyError, TypeError, ValueError, IndexError):
+        fits = False
+    if not fits or len(network.inputs) != len(sizes) + 1 or len(network.outputs) != 1:
+        raise NetworkError(
+            "its inputs or its metadata `paths` are not those of a policy that draws paths for "
+            "this arm"
+        )
+    return curves, every, line
+
+
+def find_path(
+    paths: PathsOfNetwork,
+    checker: CollisionChecker,
+    ends: np.ndarray,
+    rng: np.random.Generator,
+    search: bool = False,
+) -> tuple[np.ndarray, bool, bool]:
+    """A path from start to goal, normalised (k, n); whether it is verified; whether searched for.
+
+    Args:
+        paths: which has begun with the query.
+        checker: of what is observed.
+        ends: start and goal (2, n), normalised.
+        rng: a NumPy Generator.
+        search: see `Generative`.
+    """
+    room = checker.signed_distances(ends).distance.min(-1) - 1e-5
+    near = [(ends, np.minimum(room, margin), MARGIN_GROWTH) for margin in MARGINS]
+    if checker.is_motion_free(*ends, MARGINS[0], endpoint_margins=near[0]):
+        return ends, True, False
+    drawn = np.empty((0, *paths.curves.shape[:1], len(ends[0])), np.float32)
+    for number in range(ROUNDS):
+        fresh = DRAWS
+        new = []
+        if number:
+            best = drawn[np.argsort(paths.lacking(drawn), kind="stable")[: DRAWS // 4]]
+            new.append(paths.draw_again(np.repeat(best, 2, axis=0), rng))
+            fresh = DRAWS // 2
+        new = np.concatenate([*new, paths.draw(fresh, rng)])
+        new = new[np.argsort(paths.lacking(new), kind="stable")]
+        for some in (new[:FIRST], new[FIRST:]):
+            some = paths.repaired(some)
+            drawn = np.concatenate([drawn, some])
+            found = _shortest_free(checker, paths.knots(some), MARGINS[0], near[0], rng)
+            if found is not None:
+                return found, True, False
+    knots = paths.knots(drawn)
+    for margin, ends_near in zip(MARGINS, near, strict=True):
+        found = _assembled(checker, knots[-2 * DRAWS :], margin, ends_near)
+        if found is not None:
+            found = _finished(checker, found, margin, ends_near, rng)
+        if found is not None:
+            return found, True, False
+    if search:
+        for margin, ends_near in zip(MARGINS, near, strict=True):
+            found, _ = checker.find_path(
+                *ends, rng, margin, endpoint_margins=ends_near, max_checks=SEARCH_CHECKS
+            )
+            if found is not None:
+                return found, True, True
+    free = checker.is_motion_free(knots[:, :-1], knots[:, 1:], 0.0, endpoint_margins=near[-1])
+    return knots[np.argmax(free.sum(1))], False, search
+
+
+def _lengths(knots):
+    return np.linalg.norm(np.diff(knots, axis=1), axis=2).sum(1)
+
+
+def _shortest_free(checker, knots, margin, near, rng):
+    """The shortest of paths (m, k, n) that keeps a margin, shortened; None if none does."""
+    knots = knots[np.argsort(_lengths(knots), kind="stable")]
+    for step in (8, 2, 1):  # few configurations at first
+        free = checker.is_free(knots[:, step // 2 : -1 : step], margin, endpoint_margins=near)
+        knots = knots[free.all(1)]
+    for path in knots:
+        if checker.is_motion_free(path[:-1], path[1:], margin, endpoint_margins=near).all():
+            path = _finished(checker, path, margin, near, rng)
+            if path is not None:
+                return path
+    return None
+
+
+def _assembled(checker, knots, margin, near):
+    """The shortest free path that goes from knot to knot of any of the paths; None without one.
+
+    Motions are checked only when the shortest path would take them (Bohlin and Kavraki, 2000).
+    """
+    count, size = knots.shape[:2]
+    free = np.ones((count, size), bool)
+    free[:, 1:-1] = checker.is_free(knots[:, 1:-1], margin, endpoint_margins=near)
+    costs = np.linalg.norm(knots[None, :, 1:] - knots[:, None, :-1], axis=-1)  # (from, to, step)
+    costs = np.where(free[:, None, :-1] & free[None, :, 1:], costs, np.inf)
+    known = np.zeros(costs.shape, bool)
+    steps = np.arange(size - 1)
+    for _ in range(MOST_CHECKED):
+        total = np.zeros(count)
+        before = np.empty((size - 1, count), np.int64)
+        for step in steps:
+            through = total[:, None] + costs[:, :, step]
+            before[step], total = through.argmin(0), through.min(0)
+        at = np.empty(size, np.int64)
+        at[-1] = total.argmin()
+        if not np.isfinite(total[at[-1]]):
+            return None
+        for step in steps[::-1]:
+            at[step] = before[step, at[step + 1]]
+        new = ~known[at[:-1], at[1:], steps]
+        if not new.any():
+            return knots[at, np.arange(size)]
+        one, other, step = at[:-1][new], at[1:][new], steps[new]
+        free = checker.is_motion_free(
+            knots[one, step], knots[other, step + 1], margin, endpoint_margins=near
+        )
+        known[one, other, step] = True
+        costs[one[~free], other[~free], step[~free]] = np.inf
+    return None
+
+
+def _finished(checker, path, margin, near, rng):
+    """A path (k, n) shortened; None where it touches something between its configurations."""
+    states, room, growth = near
+    rules = Rules(
+        np.zeros(1, np.int64),
+        np.array([[margin, 0.0, growth, RESOLUTION]]),
+        np.concatenate([states, room[:, None]], axis=1)[None],
+    )
+    seed = int(rng.integers(2**63))
+    return checker.finish_path(path.astype(np.float64), rules, seed, CHORDS)[0]
+
+
+def path_metadata(curves: np.ndarray, features_every: int, line: int) -> dict[str, Any]:
+    """The metadata `paths` of a policy network that draws paths.
+
+    Args:
+        curves: (c, k): the curves of whitened coefficients, at each of k configurations.
+        features_every: the network receives the distances at every so many configurations.
+        line: at how many configurations of the straight line it receives them.
+    """
+    return {
+        "curves": np.asarray(curves).tolist(),
+        "features_every": features_every,
+        "line": line,
+    }

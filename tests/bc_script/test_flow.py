@@ -1,0 +1,128 @@
+"""flow.py, and the policies that it saves: their distances, their paths, resumed runs."""
+
+import json
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from scipy.spatial import cKDTree
+from trainers import PATHS, killed_run, run_here, run_script
+
+from roboarm_nmp import envs
+from roboarm_nmp.datasets.queries import load_queries
+from roboarm_nmp.envs.collision.checker import CollisionChecker
+from roboarm_nmp.envs.collision.distance_field import DistanceField, arm_spheres
+from roboarm_nmp.envs.perception.geometry_source import observed_checker
+from roboarm_nmp.envs.perception.point_clouds import observed_points
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.evaluation.evaluate import evaluate
+from roboarm_nmp.networks.network_file import load_network
+from roboarm_nmp.policies.generative import PathsOfNetwork, find_path
+from roboarm_nmp.policies.registry import PolicyError, make_policy
+
+HARD = "random_boxes_hard"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return run_script("flow", tmp_path_factory.mktemp("flow"), "--task", HARD)
+
+
+def test_field_has_the_distances_of_points_and_table_and_their_gradient():
+    scene = envs.get_task(HARD).scene.sample(np.random.default_rng(0))
+    points = observed_points(scene)
+    field = DistanceField(PANDA)
+    grid = field.of_scene(points, scene)[None]
+    states = np.random.default_rng(0).uniform(-1.0, 1.0, (500, 7)).astype(np.float32)
+    distances, uphill = field.distances(states, grid)
+    centres = field.centres(states).astype(np.float64)
+    expected = cKDTree(points).query(centres.reshape(-1, 3))[0].reshape(distances.shape)
+    table = scene.table
+    beside = np.abs(centres - table.position) - np.array(table.size) / 2
+    outside = np.linalg.norm(np.maximum(beside, 0.0), axis=2)
+    expected = np.minimum(expected, outside + np.minimum(beside.max(2), 0.0))
+    expected = np.minimum(expected, centres[..., 2] - scene.floor).clip(-0.05, 0.2)
+    inside = (np.abs(centres[..., :2]) < 0.9).all(2) & (centres[..., 2] < 1.2)
+    error = (distances + arm_spheres(PANDA)[:, 4] - expected)[inside]
+    assert inside.mean() > 0.9 and np.abs(error).mean() < 0.002
+    assert np.percentile(np.abs(error), 99) < 0.01  # (at the table's edges it is more)
+
+    near = np.flatnonzero((distances < 0.08).any(1))[:50]
+    numeric = np.empty((len(near), 7))
+    for joint in range(7):
+        sides = np.repeat(states[None, near], 2, axis=0)
+        sides[0, :, joint] += 1e-3
+        sides[1, :, joint] -= 1e-3
+        one, other = (field.distances(side, grid)[0] for side in sides)
+        numeric[:, joint] = np.where(distances[near] < 0.08, one - other, 0.0).sum(1) / 2e-3
+    # (Between two cells of the grid the gradient jumps.)
+    assert np.median(np.abs(numeric - uphill[near]).max(1)) < 0.01
+    assert np.corrcoef(numeric.ravel(), uphill[near].ravel())[0, 1] > 0.98
+
+
+def test_paths_are_free_in_the_cloud_and_repeatable(run):
+    network = load_network(run / "policy.onnx")
+    paths = PathsOfNetwork(network, DistanceField(PANDA))
+    queries = load_queries(HARD, "validation")
+    verified = 0
+    for i in range(6):
+        query = queries[i]
+        checker = observed_checker(query.scene)
+        ends = np.clip(PANDA.normalise([query.start, query.goal]), -1.0, 1.0)
+        found = []
+        for _ in range(2):
+            paths.begin(query.scene, *ends.astype(np.float32))
+            found.append(find_path(paths, checker, ends, np.random.default_rng(i), search=True))
+        (path, is_verified, searched), (again, *_) = found
+        assert np.array_equal(path, again) and is_verified
+        assert np.abs(path[[0, -1]] - ends).max() < 1e-6
+        # (The cloud's balls may touch the arm at start and goal already.)
+        room = np.minimum(checker.signed_distances(ends).distance.min(-1) - 1e-5, 0.0)
+        near = (ends, room, 0.05)
+        assert checker.is_motion_free(path[:-1], path[1:], endpoint_margins=near).all()
+        verified += not searched
+    assert verified >= 2  # without training, too: draws are repaired
+
+
+def test_what_cannot_be_verified_is_followed_anyway_and_searched_for_if_allowed(run):
+    class Blocked(CollisionChecker):
+        def is_motion_free(self, *args, **kwargs):
+            return np.zeros_like(super().is_motion_free(*args, **kwargs))
+
+    query = load_queries(HARD, "validation")[0]
+    paths = PathsOfNetwork(load_network(run / "policy.onnx"), DistanceField(PANDA))
+    ends = np.clip(PANDA.normalise([query.start, query.goal]), -1.0, 1.0)
+    checker = Blocked(query.scene)
+    paths.begin(query.scene, *ends.astype(np.float32))
+    path, verified, searched = find_path(paths, checker, ends, np.random.default_rng(0))
+    assert not verified and not searched and np.abs(path[[0, -1]] - ends).max() < 1e-6
+    path, verified, searched = find_path(paths, checker, ends, np.random.default_rng(0), True)
+    assert verified and searched and len(path) >= 2
+
+
+def test_killed_and_resumed_run_is_bit_identical_and_evaluated_as_validated(run, tmp_path):
+    killed = killed_run("flow", tmp_path / "killed", "--task", HARD)
+    run_here(PATHS["flow"], "--resume", killed)
+    one, other = (torch.load(each / "checkpoint.pt", weights_only=True) for each in (run, killed))
+    for name in ("network", "average"):
+        assert all(torch.equal(one[name][key], other[name][key]) for key in one[name])
+    best = json.loads((run / "result.json").read_text())["validation_success_rate"]
+    result = evaluate(run, HARD, split="validation", num_queries=2)
+    assert result["success_rate"] == best and not result["privileged"]
+    assert 0.0 <= result["verified_rate"] <= 1.0 and "search_rate" not in result
+    searched = evaluate(run, HARD, split="validation", num_queries=2, search=True)
+    assert searched["verified_rate"] == 1.0 and searched["search_rate"] <= 1.0
+
+
+@pytest.mark.parametrize(
+    "change", [{"curves": "many"}, {"line": 4}, {"features_every": 0}, {"curves": [[1.0, 2.0]]}]
+)
+def test_damaged_metadata_are_refused(run, tmp_path, change):
+    model = onnx.load(run / "policy.onnx")
+    for entry in model.metadata_props:
+        if entry.key == "paths":
+            entry.value = json.dumps(json.loads(entry.value) | change)
+    onnx.save(model, tmp_path / "bad.onnx")
+    with pytest.raises(PolicyError, match="bad.onnx: its inputs or its metadata"):
+        make_policy(tmp_path / "bad.onnx", envs.make(HARD, goal_type="config"))
