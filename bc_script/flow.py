@@ -20,6 +20,7 @@ import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -30,8 +31,7 @@ from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.evaluation.evaluate import evaluate, first_episode_images
-from roboarm_nmp.networks.export import save_network
-from roboarm_nmp.policies.registry import policy_metadata
+from roboarm_nmp.policies.export import save_path_policy
 from roboarm_nmp.policies.safety_filter import SafetyFilter
 from roboarm_nmp.training.arguments import errors_of, fail, parse_args
 from roboarm_nmp.training.cuda_graphs import adam, set_learning_rate
@@ -73,8 +73,8 @@ class Args(RunArgs):
     task: str = "random_boxes_hard"
     """a task of `roboarm_nmp.TASKS` or a scene file, whose random scenes the policy learns in and
     whose validation scenes it is evaluated in; with another arm TASK@FILE, a robot's file"""
-    goal_type: str = "config"
-    """what the goal is"""
+    goal_type: Literal["config"] = "config"
+    """goals are configurations"""
     paths: tuple[Path, ...] = ()
     """learn from these folders of roadmap paths (`roboarm roadmaps`), in scenes of any tasks of the
     same robot, instead of making roadmaps in new scenes of the task"""
@@ -231,22 +231,9 @@ class PathNetwork(nn.Module):
         share = time / ((1.0 - time) ** 2 + time**2)
         return self.head(F.silu(self.norm(x))) + noisy * share
 
-    def forward(
-        self,
-        noisy,
-        time,
-        distances,
-        uphill,
-        start,
-        goal,
-        scene,
-        line_centres,
-        line_distances,
-        line_uphill,
-    ):
+    def forward(self, noisy, time, distances, uphill, **query):
         """`predict`; policy.onnx contains this function."""
-        condition = self.encode(start, goal, scene, line_centres, line_distances, line_uphill)
-        return self.predict(condition, noisy, time, distances, uphill)
+        return self.predict(self.encode(**query), noisy, time, distances, uphill)
 
 
 # ALGO LOGIC: paths in memory
@@ -294,7 +281,6 @@ if __name__ == "__main__":
     # Here, because SciPy and Numba take a while to import, which --help would wait for.
     from roboarm_nmp.demo_generation.roadmap_examples import WholePaths
     from roboarm_nmp.envs.collision.distance_field import HINGE, DistanceField
-    from roboarm_nmp.policies.generative import path_metadata
 
     # ALGO LOGIC: network and optimiser
     distance_field = DistanceField(robot)
@@ -378,35 +364,6 @@ if __name__ == "__main__":
         optimizer.step()
         return {"losses/path": path_loss, "losses/collision": collision_loss}
 
-    # What the policy file contains besides the network
-    env_arguments = {
-        "goal_type": args.goal_type,
-        "encoder": "point_cloud",
-        "num_points": args.num_points,
-        "geometry_source": "point_cloud",
-        "link_distances": True,
-    }
-    metadata = policy_metadata(args.task, env_arguments, robot, safety_filter)
-    metadata["paths"] = path_metadata(curves.numpy(), EVERY, LINE)
-    joints, spheres = robot.num_joints, distance_field.num_spheres
-    seen_knots = len(range(EVERY, KNOTS - 1, EVERY))
-    shapes = {
-        "noisy": (args.curves * joints,),
-        "time": (1,),
-        "distances": (seen_knots, spheres),
-        "uphill": (seen_knots, joints),
-        "start": (joints,),
-        "goal": (joints,),
-        "scene": (3 * args.num_points,),
-        "line_centres": (LINE, spheres, 3),
-        "line_distances": (LINE, spheres),
-        "line_uphill": (LINE, joints),
-    }
-    rng = np.random.default_rng(0)
-    example = {
-        name: torch.from_numpy(rng.random((2, *shape), np.float32))
-        for name, shape in shapes.items()
-    }
     logged = 0.0
     run.start(args.total_updates, "update")
 
@@ -418,7 +375,8 @@ if __name__ == "__main__":
             run.interruptible = True
             latest = run.folder / "latest.onnx"
             origin = {"script": script_name(), "seed": args.seed, "step": run.step}
-            save_network(latest, average, example, metadata | origin, ["path"])
+            form = curves, EVERY, LINE, args.num_points
+            save_path_policy(latest, average, args.task, safety_filter, *form, origin)
             evaluation = {"queries": validation, "workers": max(args.workers, 1)}
             result = evaluate(latest, args.task, **evaluation)
             run.log({f"eval/{name}": result[name] for name in RESULTS})

@@ -116,7 +116,7 @@ def test_killed_and_resumed_run_is_bit_identical_and_evaluated_as_validated(run,
 
 
 @pytest.mark.parametrize(
-    "change", [{"curves": "many"}, {"line": 4}, {"features_every": 0}, {"curves": [[1.0, 2.0]]}]
+    "change", [{"curves": "many"}, {"line": 4}, {"every": 0}, {"curves": [[1.0, 2.0]]}]
 )
 def test_damaged_metadata_are_refused(run, tmp_path, change):
     model = onnx.load(run / "policy.onnx")

@@ -10,6 +10,7 @@ import copy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from roboarm_nmp import envs
@@ -85,5 +86,54 @@ def save_policy(
         raise PolicyError(f"{path}: actions for {shape[0]} observations must be {shape}, got {got}")
     try:
         save_network(path, module, example, metadata, outputs)
+    except NetworkError as error:
+        raise PolicyError(str(error)) from error
+
+
+def save_path_policy(
+    path: str | Path,
+    module: torch.nn.Module,
+    task: str | Path,
+    safety_filter: SafetyFilter | None,
+    curves: torch.Tensor,
+    every: int,
+    line: int,
+    num_points: int,
+    metadata: dict[str, Any],
+) -> None:
+    """Write a network that draws whole paths as a policy file (`policies.generative`).
+
+    Args:
+        path, task, safety_filter, metadata: as for `save_policy`.
+        module: `nn.Module`. Its `forward` receives `generative.input_shapes` by name, and `scene`,
+            observed points (N, 3 * num_points), and returns what it expects at the flow's end
+            (N, c * n).
+        curves: (c, k): the curves of a path's coefficients, at each of its k configurations.
+        every, line: as for `generative.input_shapes`.
+
+    Raises: as `save_policy`.
+    """
+    from roboarm_nmp.envs.collision.distance_field import DistanceField  # Numba is slow to import
+    from roboarm_nmp.policies.generative import input_shapes
+
+    robot = envs.get_task(task).base_scene.robot
+    spheres = DistanceField(robot).num_spheres
+    shapes = input_shapes(robot.num_joints, spheres, tuple(curves.shape), every, line)
+    rng = np.random.default_rng(0)
+    example = {
+        name: torch.from_numpy(rng.random((2, *shape), np.float32))
+        for name, shape in (shapes | {"scene": (3 * num_points,)}).items()
+    }
+    arguments = {
+        "goal_type": "config",
+        "encoder": "point_cloud",
+        "num_points": num_points,
+        "geometry_source": "point_cloud",
+        "link_distances": True,
+    }
+    metadata = policy_metadata(task, arguments, robot, safety_filter) | metadata
+    metadata["paths"] = {"curves": curves.tolist(), "every": every, "line": line}
+    try:
+        save_network(path, module, example, metadata, ["path"])
     except NetworkError as error:
         raise PolicyError(str(error)) from error

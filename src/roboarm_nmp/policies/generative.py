@@ -12,8 +12,6 @@ assembled from parts of all draws, then smaller margins do; last, where that is 
 searched for. Otherwise the arm follows the draw with the fewest contacts.
 """
 
-from typing import Any
-
 import numpy as np
 
 from roboarm_nmp.datasets.queries import Query
@@ -164,32 +162,47 @@ class PathsOfNetwork:
         return np.maximum(REPAIR_DISTANCE / 2.0 - distances, 0.0).sum((1, 2))
 
 
+def input_shapes(
+    joints: int, spheres: int, curves: tuple[int, int], every: int, line: int
+) -> dict[str, tuple[int, ...]]:
+    """The inputs of a network that draws paths, without `scene`: dict from name to shape.
+
+    Args:
+        joints, spheres: of the arm, as a `DistanceField` has them.
+        curves: (c, k): how many curves a path has, at how many configurations.
+        every: at which of these the network receives distances, each second or third or so.
+        line: at how many configurations of the straight line it receives them.
+    """
+    seen = len(range(every, curves[1] - 1, every))
+    return {
+        "noisy": (curves[0] * joints,),
+        "time": (1,),
+        "distances": (seen, spheres),
+        "uphill": (seen, joints),
+        "start": (joints,),
+        "goal": (joints,),
+        "line_centres": (line, spheres, 3),
+        "line_distances": (line, spheres),
+        "line_uphill": (line, joints),
+    }
+
+
 def _form_of_paths(network, field):
-    """`curves` (c, k) and the two numbers of `path_metadata`. Raises NetworkError."""
+    """`curves` (c, k) of whitened coefficients, and `every` and `line` of `input_shapes`."""
     form = network.metadata["paths"]
     try:
         curves = np.array(form["curves"], np.float32)
-        every, line = int(form["features_every"]), int(form["line"])
-        knots = len(range(every, curves.shape[1] - 1, every))
-        joints, spheres = field.num_joints, field.num_spheres
-        sizes = {
-            "noisy": (curves.shape[0] * joints,),
-            "time": (1,),
-            "distances": (knots, spheres),
-            "uphill": (knots, joints),
-            "start": (joints,),
-            "goal": (joints,),
-            "line_centres": (line, spheres, 3),
-            "line_distances": (line, spheres),
-            "line_uphill": (line, joints),
-        }
+        every, line = int(form["every"]), int(form["line"])
+        shapes = input_shapes(field.num_joints, field.num_spheres, curves.shape, every, line)
         points = network.inputs["scene"][1]
         fits = np.isfinite(curves).all() and points is not None and points % 3 == 0
-        fits = fits and curves.shape[1] <= MOST_KNOTS
-        fits = fits and all(network.inputs[name][1:] == size for name, size in sizes.items())
+        fits = fits and curves.shape[1] <= MOST_KNOTS and len(network.outputs) == 1
+        fits = fits and {name: (None, *shape) for name, shape in shapes.items()} == {
+            name: shape for name, shape in network.inputs.items() if name != "scene"
+        }
     except (KeyError, TypeError, ValueError, IndexError):
         fits = False
-    if not fits or len(network.inputs) != len(sizes) + 1 or len(network.outputs) != 1:
+    if not fits:
         raise NetworkError(
             "its inputs or its metadata `paths` are not those of a policy that draws paths for "
             "this arm"
@@ -315,18 +328,3 @@ def _finished(checker, path, margin, near, rng):
     )
     seed = int(rng.integers(2**63))
     return checker.finish_path(path.astype(np.float64), rules, seed, CHORDS)[0]
-
-
-def path_metadata(curves: np.ndarray, features_every: int, line: int) -> dict[str, Any]:
-    """The metadata `paths` of a policy network that draws paths.
-
-    Args:
-        curves: (c, k): the curves of whitened coefficients, at each of k configurations.
-        features_every: the network receives the distances at every so many configurations.
-        line: at how many configurations of the straight line it receives them.
-    """
-    return {
-        "curves": np.asarray(curves).tolist(),
-        "features_every": features_every,
-        "line": line,
-    }
