@@ -71,13 +71,15 @@ class RunArgs:
 @dataclass
 class Args(RunArgs):
     task: str = "random_boxes_hard"
-    """a task of `roboarm_nmp.TASKS` or a scene file, whose random scenes the policy learns in and
-    whose validation scenes it is evaluated in; with another arm TASK@FILE, a robot's file"""
+    """a task of `roboarm_nmp.TASKS` or a scene file, in whose validation scenes the policy is
+    evaluated; with another arm TASK@FILE, a robot's file"""
     goal_type: Literal["config"] = "config"
     """goals are configurations"""
     paths: tuple[Path, ...] = ()
     """learn from these folders of roadmap paths (`roboarm roadmaps`), in scenes of any tasks of the
     same robot, instead of making roadmaps in new scenes of the task"""
+    scenes: tuple[str, ...] = ()
+    """make roadmaps in random scenes of these tasks in turn; by default of `--task`"""
     stop_at_success: flags.Share | None = None
     """end at the first evaluation with this success rate on the validation queries"""
 
@@ -295,7 +297,8 @@ if __name__ == "__main__":
 
     # ALGO LOGIC: data. The pool is not in checkpoints: a resumed run makes the same paths again.
     basis = path_basis(args.curves)
-    make_paths = WholePaths(args.task, paths, encoder, args.seed, KNOTS)
+    tasks = args.scenes or (args.task,)
+    make_paths = WholePaths(tasks, paths, encoder, args.seed, KNOTS)
     pool = PathPool(args.pool_scenes)
     num_scenes = args.first_scenes + run.step // args.updates_per_scene
     pool.num_added = max(num_scenes - args.pool_scenes, 0)

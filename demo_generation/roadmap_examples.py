@@ -55,12 +55,13 @@ class WholePaths:
     """Makes whole paths of one scene after the other, with what is observed of the scene.
 
     Attributes:
-        task, paths, encoder, seed: as of `RoadmapExamples`. The field is of observed points.
+        tasks: in whose scenes roadmaps are made, in turn.
+        paths, encoder, seed: as of `RoadmapExamples`. The field is of observed points.
         points: k, at equal distances along each path.
         count: paths of each scene; with fewer, some are repeated.
     """
 
-    task: str
+    tasks: tuple[str, ...]
     paths: RoadmapPaths | None
     encoder: SceneEncoder
     seed: int
@@ -70,7 +71,8 @@ class WholePaths:
     def __call__(self, number: int) -> dict[str, np.ndarray]:
         """`scene` (z,), `field`, of `DistanceField`, and `path` float32 (count, k, j)."""
         rng = np.random.default_rng([self.seed, Stream.ROADMAP_EXAMPLES, number])
-        scene, paths = _scene_with_paths(self.task, self.paths, self.seed, number, rng)
+        task = self.tasks[number % len(self.tasks)]
+        scene, paths = _scene_with_paths(task, self.paths, self.seed, number, rng)
         chosen = rng.permutation(len(paths))
         if len(paths) < self.count:
             chosen = np.concatenate([chosen, rng.integers(len(paths), size=self.count)])
