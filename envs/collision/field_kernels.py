@@ -13,10 +13,10 @@ from roboarm_nmp.envs.collision.arm_kernels import (
     SPAN,
     place_arm,
 )
-from roboarm_nmp.envs.collision.grid_kernels import lower_row
-from roboarm_nmp.utils.numba_cache import compiled
+from roboarm_nmp.utils.numba_cache import compiled, uncounted
 
 LOWEST, HIGHEST = -0.05, 0.2  # m: distances in a field are clipped to these
+_WIDTH = 16  # places that are compared with a point at a time, a vector's
 STEP = (HIGHEST - LOWEST) / 255.0  # m: they are stored as uint8
 
 
@@ -28,21 +28,25 @@ def fill_field(points, boxes, low, cell, sizes):
     place is at `low` (3,), the others follow every `cell` m.
     """
     nx, ny, nz = sizes
-    field = np.full(nx * ny * nz, np.float32(HIGHEST * HIGHEST))
+    farthest = np.float32(HIGHEST * HIGHEST)
+    field = np.full(nx * ny * nz, farthest)
+    along = np.empty(_WIDTH, np.float32)  # squared distances in a row
     steps = int(math.ceil(HIGHEST / cell))
     for n in range(points.shape[0]):
         u = (points[n, 0] - low[0]) / cell
         v = (points[n, 1] - low[1]) / cell
         w = (points[n, 2] - low[2]) / cell
-        for a in range(max(int(u) - steps, 0), min(int(u) + steps + 2, nx)):
-            for b in range(max(int(v) - steps, 0), min(int(v) + steps + 2, ny)):
-                across = ((a - u) ** 2 + (b - v) ** 2) * cell * cell
-                if across >= HIGHEST * HIGHEST:
-                    continue
-                half = math.sqrt(HIGHEST * HIGHEST - across) / cell
-                first, last = max(int(w - half), 0), min(int(w + half) + 2, nz)
-                row = (a * ny + b) * nz
-                lower_row(field, row + first, row + last, across, first - w, cell)
+        low_a, high_a = max(int(u) - steps, 0), min(int(u) + steps + 2, nx)
+        low_b, high_b = max(int(v) - steps, 0), min(int(v) + steps + 2, ny)
+        for first in range(max(int(w) - steps, 0), min(int(w) + steps + 2, nz), _WIDTH):
+            first = min(first, nz - _WIDTH)
+            for i in range(_WIDTH):
+                along[i] = ((first + i - w) * cell) ** 2
+            for a in range(low_a, high_a):
+                for b in range(low_b, high_b):
+                    across = np.float32(((a - u) ** 2 + (b - v) ** 2) * cell * cell)
+                    if across < farthest:
+                        _lower(field, (a * ny + b) * nz + first, across, along)
     numbers = np.empty((nx, ny, nz), np.uint8)
     for a in range(nx):
         for b in range(ny):
@@ -53,6 +57,14 @@ def fill_field(points, boxes, low, cell, sizes):
                 nearest = min(max(nearest, LOWEST), HIGHEST)
                 numbers[a, b, c] = int((nearest - LOWEST) / STEP + 0.5)
     return numbers
+
+
+@uncounted
+def _lower(field, begin, across, along):
+    """Lower `_WIDTH` squared distances in a row to those from one point."""
+    for i in range(_WIDTH):
+        squared = across + along[i]
+        field[begin + i] = squared if squared < field[begin + i] else field[begin + i]
 
 
 @compiled

@@ -59,7 +59,7 @@ def distance_grid(points, farthest, within):
                 if across >= reach * reach:
                     continue
                 row = (a * ny + b) * nz
-                lower_row(near, row + first, row + last, across, first + 0.5 - w, cell)
+                _lower(near, row + first, row + last, across, first + 0.5 - w, cell)
     # A place is at most half a cell's diagonal from its centre. (And 1 um for rounding.)
     half = 0.5 * math.sqrt(3.0) * cell + 1e-6
     for i in range(near.shape[0]):
@@ -68,7 +68,7 @@ def distance_grid(points, farthest, within):
 
 
 @compiled
-def lower_row(near, begin, end, across, along, cell):
+def _lower(near, begin, end, across, along, cell):
     """Lower squared distances in a row of cells to those from one point."""
     across, along, cell = np.float32(across), np.float32(along), np.float32(cell)
     for i in range(begin, end):
