@@ -34,6 +34,7 @@ STEPS, STEPS_AGAIN = 4, 3  # of the flow; from half-way on
 MARGINS = (0.01, 0.003, 0.0)  # m
 MARGIN_GROWTH = 0.05  # m per unit of normalised distance, near a start or goal with less room
 REPAIRS, REPAIR_DISTANCE, REPAIR_RATE, MOST_REPAIR = 20, 0.04, 0.3, 0.06
+INACCURACY = 0.01  # m: of a field's distances
 MOST_KNOTS = 1_000  # of a path in a file
 MOST_CHECKED = 40  # times that motions of assembled paths are checked
 CHORDS = 40  # straight motions that are tried to shorten the chosen path
@@ -56,7 +57,7 @@ class Generative:
         self._seed = seed
         self._search = search
         self._field = DistanceField(self._robot)
-        self._source = find_geometry_source(POINT_CLOUD, self._robot)
+        self._source = find_geometry_source(POINT_CLOUD, self._robot, fine=True)
         self._network = network
         self._paths = PathsOfNetwork(network, self._field)
 
@@ -161,6 +162,10 @@ class PathsOfNetwork:
         distances, _ = self._along(self.knots(x)[:, 1:-1])
         return np.maximum(REPAIR_DISTANCE / 2.0 - distances, 0.0).sum((1, 2))
 
+    def clearances(self, knots):
+        """About the distance (m) of the arm from points at the knots of paths: (m, k)."""
+        return self._along(knots)[0].min(2)
+
 
 def input_shapes(
     joints: int, spheres: int, curves: tuple[int, int], every: int, line: int
@@ -243,12 +248,12 @@ def find_path(
         for some in (new[:FIRST], new[FIRST:]):
             some = paths.repaired(some)
             drawn = np.concatenate([drawn, some])
-            found = _shortest_free(checker, paths.knots(some), MARGINS[0], near[0], rng)
+            found = _shortest_free(paths, checker, paths.knots(some), MARGINS[0], near[0], rng)
             if found is not None:
                 return found, True, False
     knots = paths.knots(drawn)
     for margin, ends_near in zip(MARGINS, near, strict=True):
-        found = _assembled(checker, knots[-2 * DRAWS :], margin, ends_near)
+        found = _assembled(paths, checker, knots[-2 * DRAWS :], margin, ends_near)
         if found is not None:
             found = _finished(checker, found, margin, ends_near, rng)
         if found is not None:
@@ -259,37 +264,45 @@ def find_path(
                 *ends, rng, margin, endpoint_margins=ends_near, max_checks=SEARCH_CHECKS
             )
             if found is not None:
+                found = _finished(checker, found, margin, ends_near, rng)
+            if found is not None:
                 return found, True, True
-    free = checker.is_motion_free(knots[:, :-1], knots[:, 1:], 0.0, endpoint_margins=near[-1])
-    return knots[np.argmax(free.sum(1))], False, search
+    knots = knots[np.argsort(paths.lacking(drawn), kind="stable")[:DRAWS]]
+    free = checker.is_motion_free(knots[:, :-1], knots[:, 1:], endpoint_margins=near[-1])
+    return knots[free.sum(1).argmax()], False, search
 
 
 def _lengths(knots):
     return np.linalg.norm(np.diff(knots, axis=1), axis=2).sum(1)
 
 
-def _shortest_free(checker, knots, margin, near, rng):
+def _shortest_free(paths, checker, knots, margin, near, rng):
     """The shortest of paths (m, k, n) that keeps a margin, shortened; None if none does."""
     knots = knots[np.argsort(_lengths(knots), kind="stable")]
-    for step in (8, 2, 1):  # few configurations at first
-        free = checker.is_free(knots[:, step // 2 : -1 : step], margin, endpoint_margins=near)
-        knots = knots[free.all(1)]
-    for path in knots:
-        if checker.is_motion_free(path[:-1], path[1:], margin, endpoint_margins=near).all():
+    clearances = paths.clearances(knots)
+    for path, clearance in zip(knots, clearances, strict=True):
+        # The motions with the least distance first, a few at a time.
+        order = np.argsort(np.minimum(clearance[:-1], clearance[1:]), kind="stable")
+        for some in np.array_split(order, (2, 8)):
+            if not checker.is_motion_free(
+                path[some], path[some + 1], margin, endpoint_margins=near
+            ).all():
+                break
+        else:
             path = _finished(checker, path, margin, near, rng)
             if path is not None:
                 return path
     return None
 
 
-def _assembled(checker, knots, margin, near):
+def _assembled(paths, checker, knots, margin, near):
     """The shortest free path that goes from knot to knot of any of the paths; None without one.
 
     Motions are checked only when the shortest path would take them (Bohlin and Kavraki, 2000).
     """
     count, size = knots.shape[:2]
-    free = np.ones((count, size), bool)
-    free[:, 1:-1] = checker.is_free(knots[:, 1:-1], margin, endpoint_margins=near)
+    free = paths.clearances(knots) > -INACCURACY
+    free[:, [0, -1]] = True
     costs = np.linalg.norm(knots[None, :, 1:] - knots[:, None, :-1], axis=-1)  # (from, to, step)
     costs = np.where(free[:, None, :-1] & free[None, :, 1:], costs, np.inf)
     known = np.zeros(costs.shape, bool)
