@@ -128,13 +128,16 @@ class PathsOfNetwork:
         times = np.linspace(begin, 1.0, steps + 1)
         for now, then in zip(times[:-1], times[1:], strict=True):
             distances, uphill = self._along(self.knots(x)[:, self._every : -1 : self._every])
-            path: np.ndarray = self._network(
+            path = self._network(
                 noisy=x.reshape(number, -1),
                 time=np.full((number, 1), now, np.float32),
                 distances=distances,
                 uphill=uphill,
                 **query,
-            ).reshape(x.shape)
+            )
+            if path.shape != (number, x[0].size) or not np.isfinite(path).all():
+                raise NetworkError("a path that it draws has another size, or is not finite")
+            path = path.reshape(x.shape)
             x = x + (path - x) * np.float32((then - now) / (1.0 - now))
         return x
 
