@@ -272,6 +272,8 @@ if __name__ == "__main__":
     args = parse_args(Args, may_change={"test_queries", "workers"})
     device = seed_torch(args)
     validation, test = load_task(args)
+    if device.type != "cpu":
+        fail("--device: the distances along paths are computed on the CPU, so it must be cpu")
     if args.first_scenes > args.pool_scenes:
         fail("--first-scenes must be at most --pool-scenes")
     robot = validation.scenes.base.robot

@@ -27,6 +27,7 @@ SHORT = {
     "td3_her_mp": ["--geometry-source", "ground_truth", "--link-distances"],
     "bc": ["--num-modes", "2", "--eval-every", "600"],
     "roadmap_bc": ["--encoder", "point_cloud", "--eval-every", "40"],
+    "flow": ["--eval-every", "40"],
 }
 SHORT["td3_her_mp"] += ["--demo-prob", "1", "--bc-weight", "2"]
 
