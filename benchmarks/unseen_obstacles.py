@@ -87,6 +87,9 @@ for _name, _policy, _filter, _source in (
         f"{_name}, no escape": [*_flags, *_filter, "--no-escape"],
         _name: _flags,  # its own filter
     }
+FLOW = "flow, point_cloud"
+CELLS[FLOW] = ["--policy", "flow-config-point_cloud-wide_scenes-s1"]
+CELLS[f"{FLOW}, search"] = [*CELLS[FLOW], "--search"]
 # Decoded points are less exact than observed ones.
 CELLS[DECODED] = [*CELLS[DECODED], "--safety-margin", "0.015"]
 PRIVILEGED = "ground truth (privileged)"
@@ -106,8 +109,10 @@ ROWS = (
     ("roadmap BC", "point cloud", "point cloud", OBSERVED),
     ("roadmap BC, mixed scenes", "point cloud", "point cloud", f"{OBSERVED}, mixed scenes"),
     ("roadmap BC", PRIVILEGED, PRIVILEGED, "roadmap BC, oracle"),
+    ("flow", "point cloud", "point cloud", FLOW),
 )
 SEARCHING = (
+    ("flow, searches where it verifies nothing", "point cloud", f"{FLOW}, search"),
     ("plan from the decoded cloud", "latent code (field)", "plan from the decoded cloud, field"),
     ("plan from the point cloud", "point cloud", "plan from the point cloud"),
     ("RRT-Connect", PRIVILEGED, "RRT-Connect"),
@@ -119,6 +124,8 @@ EVERYWHERE = (
         OBSERVED,
         f"{OBSERVED}, mixed scenes",
         "roadmap BC, oracle",
+        FLOW,
+        f"{FLOW}, search",
     ),
     "plan from the point cloud",
 )
@@ -138,6 +145,8 @@ SHOWN = {
     OBSERVED: "roadmap BC, point cloud",
     f"{OBSERVED}, mixed scenes": "roadmap BC, mixed scenes",
     "roadmap BC, oracle": "roadmap BC, privileged",
+    FLOW: "flow",
+    f"{FLOW}, search": "flow, search",
 }
 UNSEEN = [
     name for name, task in STATIC_TASKS.items() if name.startswith("random") or not task.trainable
@@ -153,6 +162,7 @@ KEPT = ("success_rate", "success_rate_interval", "collision_free_success_rate")
 KEPT += ("collision_free_success_rate_interval", "num_queries", "ms_per_action", "planning_seconds")
 KEPT += ("mean_steps", "path_length", "env", "geometry_source", "privileged", "safety_filter")
 KEPT += ("seed",)
+KEPT_OF_FLOW = ("verified_rate", "search_rate")
 FILTER_MARKS = {1: "\\*", 2: "‡"}  # by the version of the safety filter that a result had
 ENCODER_MARK = "†"
 MARKS = {
@@ -166,10 +176,14 @@ def keep(run):
     """Put a run's policy where it is found by name, in half precision, with how it was made."""
     training = json.loads((run / "result.json").read_text())
     args = training["args"]
-    # Those that it learned from: a folder, or the first of several.
-    paths = args["paths"][0] if isinstance(args["paths"], list) else args["paths"]
-    scenes = load_roadmap_paths(Path(paths)).task
-    name = f"roadmap-bc-{args['goal_type']}-{args['encoder']}-{scenes}-s{args['seed']}"
+    # Those that it learned from: a folder, or the first of several; or the first of its tasks.
+    scenes = (args.get("scenes") or [args["task"]])[0]
+    if args["paths"]:
+        paths = args["paths"][0] if isinstance(args["paths"], list) else args["paths"]
+        scenes = load_roadmap_paths(Path(paths)).task
+    trainer = training["script"].replace("_", "-")
+    encoder = args.get("encoder", "point_cloud")
+    name = f"{trainer}-{args['goal_type']}-{encoder}-{scenes}-s{args['seed']}"
     to_float16(run / "policy.onnx", POLICIES / f"{name}.onnx")
     made = {"cell": name.rpartition("-")[0], "seed": args["seed"], "steps": training["steps"]}
     made |= {key: training[key] for key in ("policy_step", "validation_success_rate")}
@@ -215,7 +229,8 @@ def run(tasks, names, num, workers):
                 command += ["--workers", str(workers), "--json", path]
                 subprocess.run(command, check=True)
                 result = json.loads(path.read_text())
-            result = {key: result[key] for key in KEPT}
+            kept = [*KEPT, *(key for key in KEPT_OF_FLOW if key in result)]
+            result = {key: result[key] for key in kept}
             result |= {"flags": CELLS[name], "date": datetime.date.today().isoformat()}
             result["encoders"] = digests(result)
             results = load_results()  # again: another run of this may have added to it
@@ -326,7 +341,9 @@ def policies_table(hard):
         if cell in hard:
             result = hard[cell]
             row = [method, observation, source, "no", *_numbers(result)]
-            rows.append([*row, f"{result['ms_per_action']:.1f}", NOTHING])
+            seconds = result["planning_seconds"]
+            planning = NOTHING if seconds is None else f"{seconds:.3f}"
+            rows.append([*row, f"{result['ms_per_action']:.1f}", planning])
     for method, source, cell in SEARCHING:
         if cell in hard:
             result = hard[cell]
