@@ -162,7 +162,7 @@ KEPT = ("success_rate", "success_rate_interval", "collision_free_success_rate")
 KEPT += ("collision_free_success_rate_interval", "num_queries", "ms_per_action", "planning_seconds")
 KEPT += ("mean_steps", "path_length", "env", "geometry_source", "privileged", "safety_filter")
 KEPT += ("seed",)
-KEPT_OF_FLOW = ("verified_rate", "search_rate")
+KEPT_OF_SOME = ("verified_rate", "search_rate", "unobserved_share")
 FILTER_MARKS = {1: "\\*", 2: "‡"}  # by the version of the safety filter that a result had
 ENCODER_MARK = "†"
 MARKS = {
@@ -229,7 +229,7 @@ def run(tasks, names, num, workers):
                 command += ["--workers", str(workers), "--json", path]
                 subprocess.run(command, check=True)
                 result = json.loads(path.read_text())
-            kept = [*KEPT, *(key for key in KEPT_OF_FLOW if key in result)]
+            kept = [*KEPT, *(key for key in KEPT_OF_SOME if key in result)]
             result = {key: result[key] for key in kept}
             result |= {"flags": CELLS[name], "date": datetime.date.today().isoformat()}
             result["encoders"] = digests(result)

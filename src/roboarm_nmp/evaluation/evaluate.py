@@ -195,6 +195,8 @@ def evaluate(
           `action_delay` (steps, or `real_time`), `versions`;
         - `geometry_source`: where obstacles were taken from, None if from nowhere; `privileged`:
           whether policy, filter or observations received the ground-truth obstacles;
+        - where sensors observe a static scene once, `unobserved_share`: the mean share of the
+          arm's motion that passes through space that no sensor sees;
         - of a policy that draws paths, `verified_rate`, and with `search` the `search_rate`: the
           shares of queries with a verified path, and of those for which one was searched for;
         - `replan`, `search`, `observe_every`, `sensor_noise` (a dict), where they were given.
@@ -461,13 +463,16 @@ def _in_use(policy, options):
             if getattr(options, name) is not None:
                 raise EvaluationError(f"{name}: this policy observes nothing of the scene")
     noise = options.sensor_noise
-    uses_sensors = source not in (None, GROUND_TRUTH) or encoder not in (None, ORACLE)
-    if noise is not None and noise.changes_images and not uses_sensors:
+    if noise is not None and noise.changes_images and not _uses_sensors(source, encoder):
         raise EvaluationError(
             "sensor_noise: nothing is observed by sensors; choose the geometry source point_cloud, "
             "or a policy that receives an encoded scene"
         )
     return replace(options, env=env, geometry_source=source, safety_filter=safety_filter)
+
+
+def _uses_sensors(geometry_source, encoder):
+    return geometry_source not in (None, GROUND_TRUTH) or encoder not in (None, ORACLE)
 
 
 def _queries(task, options):
@@ -527,6 +532,9 @@ class _Worker:
             torch.set_num_threads(1)
         self.job = job
         self.env, self.begin = job.make()
+        options = job.options
+        uses_sensors = _uses_sensors(options.geometry_source, options.env.get("encoder"))
+        self._observes_once = uses_sensors and not options.observe_every
 
     def __call__(self, indices: range) -> tuple[range, list[Outcome]]:
         """`indices`, and their outcomes."""
@@ -554,6 +562,12 @@ class _Worker:
             "plan_found": plan_found,
             "searched": searched,
         }
+        if self._observes_once and query.scene.is_static:
+            # Here, because Numba takes a while to import.
+            from roboarm_nmp.envs.perception.visibility import unobserved_share
+
+            states = query.scene.robot.normalise(trajectory.configurations)
+            outcome["unobserved_share"] = unobserved_share(query.scene, states)
         if self.job.record:
             outcome["episode"] = RecordedEpisode(
                 trajectory.actions.astype(np.float32),
@@ -691,6 +705,8 @@ def _summary(job: _Job, outcomes: list[Outcome]) -> dict[str, Any]:
         result["observe_every"] = options.observe_every
     if options.sensor_noise:
         result["sensor_noise"] = options.sensor_noise.to_metadata()
+    if all("unobserved_share" in outcome for outcome in outcomes):
+        result["unobserved_share"] = _mean(outcomes, "unobserved_share")
     if options.replan:
         result["replan"] = True
     if policy not in BASELINES and outcomes[0]["plan_found"] is not None:

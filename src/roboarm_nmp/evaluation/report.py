@@ -50,6 +50,7 @@ def report(result: dict[str, Any]) -> str:
         number = "-" if value is None else f"{value:.4g}"
         lines.append(f"  {label:<24}{number:>9}  {unit}")
     for label, name in (
+        ("motion in unseen space", "unobserved_share"),
         ("free motion", "free_motion_rate"),
         ("path verified", "verified_rate"),
         ("  ... by search", "search_rate"),

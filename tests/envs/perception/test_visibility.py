@@ -1,0 +1,30 @@
+"""What the four sensors see."""
+
+import numpy as np
+
+from roboarm_nmp.envs.perception.visibility import are_seen, unobserved_share
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.scenes.primitives import Box, Scene
+
+CENTRE, EDGE = np.array([0.5, 0.0, 0.4]), 0.3
+
+
+def test_inside_of_a_closed_box_is_not_seen_and_space_around_it_is():
+    walls = []
+    for axis in range(3):
+        size = np.full(3, EDGE)
+        size[axis] = 0.01
+        for side in (-1, 1):
+            position = CENTRE.copy()
+            position[axis] += side * EDGE / 2
+            walls.append(Box(tuple(position), tuple(size)))
+    scene = Scene(obstacles=tuple(walls))
+    rng = np.random.default_rng(0)
+    inside = CENTRE + rng.uniform(-0.12, 0.12, (300, 3))
+    above = rng.uniform((-0.5, -0.5, 0.9), (0.5, 0.5, 1.2), (300, 3))
+    assert not are_seen(scene, inside).any() and are_seen(scene, above).all()
+    assert are_seen(Scene(), inside).all()
+    observed = PANDA.normalise(np.array([PANDA.observed_pose]))
+    assert unobserved_share(Scene(), observed) == 0.0  # the arm itself is known
+    states = rng.uniform(-1.0, 1.0, (200, 7))
+    assert unobserved_share(Scene(), states) < unobserved_share(scene, states) < 0.1
