@@ -245,7 +245,7 @@ class PathPool:
     def __init__(self, num_scenes):
         self.num_scenes = num_scenes
         self.num_added = 0
-        self.arrays = {}  # (num_scenes, ...), allocated with the first scene
+        self.arrays: dict[str, np.ndarray] = {}  # (num_scenes, ...), allocated with the first scene
 
     def add(self, arrays):
         """Add a scene, in place of the oldest when all are there."""

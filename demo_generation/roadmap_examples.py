@@ -17,7 +17,6 @@ collide:
 - `length` float32 (n,): of the remaining path, normalised.
 """
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -43,11 +42,11 @@ def _scene_with_paths(task, paths, seed, number, rng):
     """Scene `number` and its paths: of `paths`, or a new one of the task if that is None."""
     if paths is not None:
         return paths.random_scene(rng)
-    # In a scene without room for the arm there may be no path.
-    for index in itertools.count(number, MORE_SCENES):
-        scene, found = random_paths_of_scene(index, task, seed)
-        if found:
+    while True:
+        scene, found = random_paths_of_scene(number, task, seed)
+        if found:  # in a scene without room for the arm there may be no path
             return scene, found
+        number += MORE_SCENES
 
 
 @dataclass

@@ -118,7 +118,7 @@ def save_path_policy(
 
     robot = envs.get_task(task).base_scene.robot
     spheres = DistanceField(robot).num_spheres
-    shapes = input_shapes(robot.num_joints, spheres, tuple(curves.shape), every, line)
+    shapes = input_shapes(robot.num_joints, spheres, curves.shape, every, line)
     rng = np.random.default_rng(0)
     example = {
         name: torch.from_numpy(rng.random((2, *shape), np.float32))

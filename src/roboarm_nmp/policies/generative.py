@@ -82,10 +82,10 @@ class PathsOfNetwork:
     def __init__(self, network: Network, field: DistanceField):
         self._network = network
         self._field = field
-        self.curves, self._every, self._line = _form_of_paths(network, field)
+        self.curves, self._every, self._line, num_points = _form_of_paths(network, field)
         share = np.linspace(0.0, 1.0, self.curves.shape[1], dtype=np.float32)
         self._share = share[:, None]  # of the straight line
-        self._encoder = make_encoder(POINT_CLOUD, network.inputs["scene"][1] // 3)
+        self._encoder = make_encoder(POINT_CLOUD, num_points)
 
     def begin(self, scene, start, goal):
         """Begin a query: observe a `Scene`; start and goal are float32 (n,), normalised."""
@@ -171,7 +171,7 @@ class PathsOfNetwork:
 
 
 def input_shapes(
-    joints: int, spheres: int, curves: tuple[int, int], every: int, line: int
+    joints: int, spheres: int, curves: tuple[int, ...], every: int, line: int
 ) -> dict[str, tuple[int, ...]]:
     """The inputs of a network that draws paths, without `scene`: dict from name to shape.
 
@@ -196,14 +196,14 @@ def input_shapes(
 
 
 def _form_of_paths(network, field):
-    """`curves` (c, k) of whitened coefficients, and `every` and `line` of `input_shapes`."""
+    """`curves` (c, k) of whitened coefficients, `every`, `line`, and the number of points."""
     form = network.metadata["paths"]
     try:
         curves = np.array(form["curves"], np.float32)
         every, line = int(form["every"]), int(form["line"])
         shapes = input_shapes(field.num_joints, field.num_spheres, curves.shape, every, line)
-        points = network.inputs["scene"][1]
-        fits = np.isfinite(curves).all() and points is not None and points % 3 == 0
+        numbers = network.inputs["scene"][1] or 0
+        fits = np.isfinite(curves).all() and numbers > 0 and numbers % 3 == 0
         fits = fits and curves.shape[1] <= MOST_KNOTS and len(network.outputs) == 1
         fits = fits and {name: (None, *shape) for name, shape in shapes.items()} == {
             name: shape for name, shape in network.inputs.items() if name != "scene"
@@ -215,7 +215,7 @@ def _form_of_paths(network, field):
             "its inputs or its metadata `paths` are not those of a policy that draws paths for "
             "this arm"
         )
-    return curves, every, line
+    return curves, every, line, numbers // 3
 
 
 def find_path(
@@ -234,9 +234,10 @@ def find_path(
         rng: a NumPy Generator.
         search: see `Generative`.
     """
+    start, goal = ends
     room = checker.signed_distances(ends).distance.min(-1) - 1e-5
     near = [(ends, np.minimum(room, margin), MARGIN_GROWTH) for margin in MARGINS]
-    if checker.is_motion_free(*ends, MARGINS[0], endpoint_margins=near[0]):
+    if checker.is_motion_free(start, goal, MARGINS[0], endpoint_margins=near[0]):
         return ends, True, False
     drawn = np.empty((0, *paths.curves.shape[:1], len(ends[0])), np.float32)
     for number in range(ROUNDS):
@@ -264,7 +265,7 @@ def find_path(
     if search:
         for margin, ends_near in zip(MARGINS, near, strict=True):
             found, _ = checker.find_path(
-                *ends, rng, margin, endpoint_margins=ends_near, max_checks=SEARCH_CHECKS
+                start, goal, rng, margin, endpoint_margins=ends_near, max_checks=SEARCH_CHECKS
             )
             if found is not None:
                 found = _finished(checker, found, margin, ends_near, rng)
