@@ -28,9 +28,10 @@ from roboarm_nmp.policies.policy import EpisodePolicy
 from roboarm_nmp.policies.pose_goals import observed_at_start
 
 # The numbers below were chosen on validation queries: docs/algorithms/flow.md.
-DRAWS, ROUNDS = 32, 3  # paths per round, rounds
+ROUNDS = 8
+DRAWS, DRAWS_LATER = 32, 64  # paths in the first round, and in later ones
 FIRST = 8  # of a round, those that lack the least distance are repaired and checked first
-STEPS, STEPS_AGAIN = 4, 3  # of the flow; from half-way on
+STEPS, STEPS_LATER, STEPS_AGAIN = 4, 8, 4  # of the flow; from half-way on
 MARGINS = (0.01, 0.003, 0.0)  # m
 MARGIN_GROWTH = 0.05  # m per unit of normalised distance, near a start or goal with less room
 REPAIRS, REPAIR_DISTANCE, REPAIR_RATE, MOST_REPAIR = 20, 0.04, 0.3, 0.06
@@ -109,10 +110,10 @@ class PathsOfNetwork:
         path = self.start * (1.0 - self._share) + self.goal * self._share + bends
         return np.clip(path, -1.0, 1.0)
 
-    def draw(self, number, rng):
-        """Coefficients of new paths: (m, c, n)."""
+    def draw(self, number, steps, rng):
+        """Coefficients of new paths, in so many steps of the flow: (m, c, n)."""
         noise = rng.standard_normal((number, len(self.curves), len(self.start)), np.float32)
-        return self._flow(noise, 0.0, STEPS)
+        return self._flow(noise, 0.0, steps)
 
     def draw_again(self, x, rng):
         """Coefficients of paths like those of x: half noise, and again through the flow."""
@@ -241,13 +242,13 @@ def find_path(
         return ends, True, False
     drawn = np.empty((0, *paths.curves.shape[:1], len(ends[0])), np.float32)
     for number in range(ROUNDS):
-        fresh = DRAWS
+        fresh, steps = DRAWS, STEPS
         new = []
         if number:
             best = drawn[np.argsort(paths.lacking(drawn), kind="stable")[: DRAWS // 4]]
             new.append(paths.draw_again(np.repeat(best, 2, axis=0), rng))
-            fresh = DRAWS // 2
-        new = np.concatenate([*new, paths.draw(fresh, rng)])
+            fresh, steps = DRAWS_LATER, STEPS_LATER
+        new = np.concatenate([*new, paths.draw(fresh, steps, rng)])
         new = new[np.argsort(paths.lacking(new), kind="stable")]
         for some in (new[:FIRST], new[FIRST:]):
             some = paths.repaired(some)
