@@ -24,7 +24,6 @@ from roboarm_nmp.datasets.demonstrations import load_demos
 from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.scenes.files import load_scene
 from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE
-from roboarm_nmp.viewer import show
 
 SCRIPTS = ROOT / "clean_rl_scripts"
 sys.path.append(str(SCRIPTS))
@@ -110,7 +109,7 @@ def page(tmp_path_factory):
     folder, results, names = tmp_path_factory.mktemp("page"), {}, {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(show, "MAX_FRAMES", 4)
+        patch.setattr("roboarm_nmp.viewer.images.MAX_FRAMES", 4)
         for kind, text in BLOCKS:
             if kind == "yaml":
                 name = Path(text.split()[1])  # its first line: "# NAME"

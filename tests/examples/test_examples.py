@@ -47,7 +47,7 @@ def test_planned_path_is_checked_exported_and_can_be_shown(run, tmp_path, capsys
     query = load_queries("double_walls")[2]
     np.testing.assert_allclose(configurations[[0, -1]], [query.start, query.goal], atol=1e-6)
     np.testing.assert_allclose(np.diff(times), 1 / 30)
-    monkeypatch.setattr(show, "MAX_FRAMES", 1)
+    monkeypatch.setattr("roboarm_nmp.viewer.images.MAX_FRAMES", 1)
     shown = ["--trajectory", tmp_path / file, "--output", tmp_path / "a.gif", "--size", 80, 60]
     assert show.main(["double_walls", *map(str, shown)]) == 0
     assert "collision-free" in capsys.readouterr().out

@@ -1,14 +1,20 @@
 """`roboarm view` and `roboarm demo`: their errors, each in one line, and the replay."""
 
 import contextlib
+import io
 import signal
 import socket
 import subprocess
 import sys
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from PIL import Image
 
-from roboarm_nmp.viewer import app, demo
+from roboarm_nmp.envs.world import World
+from roboarm_nmp.viewer import app, demo, images
+from roboarm_nmp.viewer.simulation import PolicyArm
 
 pytest.importorskip("viser")
 
@@ -87,3 +93,101 @@ def test_recordings_of_demonstrations_and_of_policies_are_written(capfd, tmp_pat
     assert [arm.split(":")[0].strip() for arm in arms] == ["demonstration", "go-to-goal"]
     contents = path.read_text()
     assert "__VISER_EMBED_DATA__" in contents and len(contents) < 1_000_000
+
+
+# --- What the page's controls do
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    args = app.Args(task="wall")
+    simulation = app._simulation(args)
+    for _ in range(2):
+        simulation.add(PolicyArm("wall", "go-to-goal"))
+    server = app._server("127.0.0.1", 0)
+    folder = str(tmp_path_factory.mktemp("roboarm-view-"))
+    choices = app._choices(args, simulation)[1]
+    yield app._Page(server, simulation, args, choices, lambda *_: None, folder)
+    simulation.close()
+    app._stop(server)
+
+
+def event(value, client=None):
+    """As viser's, of a control that a page has changed."""
+    return SimpleNamespace(target=SimpleNamespace(value=value), client=client or object())
+
+
+def do(page):
+    page._do_work(0.0)
+    page._update_controls()
+    page._update_status()
+
+
+def drop(page, name, contents):
+    page._file_chosen(event(SimpleNamespace(name=name, content=contents)))
+    do(page)
+
+
+def test_dropped_scene_and_cloud_are_opened_and_a_bad_file_loses_nothing(page):
+    before = page.simulation.query
+    bad = [
+        ("a.yaml", b"obstacles:\n  - bax: {}\n", "<b>a.yaml:2: unknown kind of obstacle bax"),
+        ("a.docx", b"", "a.docx: a scene ends in .yaml"),
+        ("a.npy", b"no", "a.npy"),
+    ]
+    for name, contents, message in bad:
+        drop(page, name, contents)
+        assert message in page._status.content and page._folder not in page._status.content
+        assert page.simulation.query is before and page._opened is None
+    drop(page, "a.yaml", b"obstacles: [sphere: {position: [0, 0.9, 0], radius: 0.1}]")
+    args, simulation = page.run()
+    assert len(simulation.query.scene.obstacles) == 1 and args.task.endswith("/a.yaml")
+    simulation.close()
+    page._opened, cloud = None, io.BytesIO()
+    np.save(cloud, np.random.default_rng(0).uniform((0.5, -0.4, 0.1), (0.6, 0.4, 0.5), (3000, 3)))
+    drop(page, "cloud.npy", cloud.getvalue())
+    args, simulation = page.run()
+    assert len(simulation.query.scene.points) > 100 and args.task == "no_obstacles"
+    simulation.close()
+    page._opened = None
+
+
+def test_sliders_show_contacts_and_make_starts_and_goals(page):
+    query = page.simulation.query
+    world = World(query.scene, drawn=False)
+    for angle in (1.2, -1.0):  # of the second joint: into the wall, and back
+        page._slider_moved(event(angle), 1)
+        do(page)
+        configuration = np.array(page._angles.value.split(", "), float)
+        assert configuration[1] == angle and not page.playing
+        assert np.allclose(np.delete(configuration - query.start, 1), 0.0, atol=1e-4)
+        in_contact = world.in_collision(configuration)
+        assert ("**contact**" in page._clearance.content) == in_contact == (angle > 0.0)
+    world.close()
+    page._use_pose("start")
+    assert np.allclose(page.simulation.query.start, configuration, atol=1e-4)
+    page._angles_typed(event("0, -0.5, 0, -2, 0, 1.6"))
+    do(page)
+    assert "joint angles must be 7 finite numbers" in page._status.content
+    page._angles_typed(event("0 -0.5 0 -2 0 1.6 0"))
+    do(page)
+    assert page._sliders[3].value == -2.0
+    page._use_pose("goal")
+    assert np.allclose(page.simulation.query.goal, [0, -0.5, 0, -2, 0, 1.6, 0])
+    page.simulation.select("test", 0)
+
+
+def test_motion_is_exported_as_gif_with_all_arms_side_by_side(page, monkeypatch):
+    monkeypatch.setattr(images, "MAX_FRAMES", 3)
+    for _ in range(9):
+        page.simulation.step()
+    saved = {}
+    client = SimpleNamespace(
+        camera=SimpleNamespace(position=(2, 0, 1), look_at=(0, 0, 0.4)),
+        send_file_download=lambda name, contents, **_: saved.update({name: contents}),
+    )
+    monkeypatch.setattr(app.threading.Thread, "start", app.threading.Thread.run)
+    page._export_motion(client)
+    with Image.open(io.BytesIO(saved["motion.gif"])) as animation:
+        width, height = images.SIZE
+        assert animation.size == (2 * width, height) and animation.n_frames == 4

@@ -37,7 +37,7 @@ def env():
 
 @pytest.fixture(autouse=True)
 def few_frames(monkeypatch):
-    monkeypatch.setattr(show, "MAX_FRAMES", 2)
+    monkeypatch.setattr(images, "MAX_FRAMES", 2)
 
 
 def run(*arguments):
@@ -128,7 +128,7 @@ def save(path, **metadata):
 
 
 def test_animation_shows_the_episode_of_a_policy(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(show, "MAX_FRAMES", 5)
+    monkeypatch.setattr(images, "MAX_FRAMES", 5)
     save(tmp_path / "policy.onnx")
     arguments = ["--query", 2, *SIZE, "--policy", tmp_path]
     assert run("wall", "--output", tmp_path / "a.gif", *arguments) == 0

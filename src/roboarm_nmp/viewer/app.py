@@ -11,20 +11,25 @@
     roboarm view wall --policy planner --record replay.html
 
 Several policies stand side by side, each with its own copy of the scene. The page offers queries,
-play and pause, speed, what is drawn, and edits. Dragging the goal or an obstacle changes to a
-kinematic simulation, without forces, in which every arm goes on from where it is; Restart runs the
-edited query in the physics. `--record` writes a replay, one HTML file that plays without a server.
+play and pause, speed, what is drawn, edits, and sliders for the joints. It opens scene files and
+point clouds that are dropped on it, and saves the motion as a GIF. Dragging the goal or an obstacle
+changes to a kinematic simulation, without forces, in which every arm goes on from where it is;
+Restart runs the edited query in the physics. `--record` writes a replay, one HTML file that plays
+without a server.
 
 The page is only for this machine, unless `--host` says otherwise. Ctrl-C ends the command.
 """
 
 import contextlib
+import html
 import io
 import logging
 import math
 import queue
+import re
 import socket
 import sys
+import tempfile
 import threading
 import time
 import webbrowser
@@ -37,10 +42,12 @@ import numpy as np
 import tyro
 
 from roboarm_nmp import envs
-from roboarm_nmp.datasets.cloud_flags import CloudFlags, check_without_cloud
+from roboarm_nmp.datasets.cloud_flags import CloudFlags, check_without_cloud, configuration_in
+from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Sphere
+from roboarm_nmp.envs.tasks import SCENE_FILES, split_robot
 from roboarm_nmp.envs.world import SUBSTEPS, TIME_STEP
 from roboarm_nmp.policies.baselines import BASELINES
 from roboarm_nmp.policies.registry import policy_file, pretrained_policies
@@ -50,6 +57,7 @@ from roboarm_nmp.utils.flags import NonNegativeFloat, NonNegativeInt, PositiveFl
 from roboarm_nmp.utils.signals import end_with_one_line, error_line
 from roboarm_nmp.viewer.episodes import (
     DEMO,
+    Episodes,
     cloud_episodes,
     demonstration_episodes,
     roadmap_episodes,
@@ -74,12 +82,29 @@ MAX_QUERY = 1_000_000  # of random queries, which have no end
 NEEDS_VISER = "the viewer needs viser: pip install viser"
 PHYSICS = "Physics, as in an evaluation."
 KINEMATIC = (
-    "**Kinematic simulation**, because goal or scene were edited: no forces, and obstacles do not "
-    "stop the arm. *Restart* runs the edited query in the physics."
+    "<b>Kinematic simulation</b>, because goal or scene were edited: no forces, and obstacles do "
+    "not stop the arm. <i>Restart</i> runs the edited query in the physics."
 )
 NEW_OBSTACLES = ("box", "cylinder", "sphere")
 POINT_CLOUD_PLANNER = "planner (point cloud)"  # in the page's list of policies
 NO_OBSTACLE = "none"
+NOT_POSED = "Move a joint: the arms stop, and are shown there."
+UPLOADS = "roboarm-view-"  # how the folders of dropped files begin
+# A file that is dropped anywhere on the page goes the way of the upload button, which takes none by
+# itself. The image is how a script comes into the page: viser has no other place for one.
+DROP = """<img style="display: none" src="data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAA\
+AAABAAEAAAICTAEAOw==" onload="
+    if (window.opensDroppedFiles) return;
+    window.opensDroppedFiles = true;
+    window.addEventListener('dragover', (event) => event.preventDefault());
+    window.addEventListener('drop', (event) => {
+        const button = document.querySelector('input[type=file]');
+        if (!event.dataTransfer.files.length) return;
+        event.preventDefault();
+        button.files = event.dataTransfer.files;
+        button.dispatchEvent(new Event('change', {bubbles: true}));
+    });
+">"""
 
 
 @dataclass(kw_only=True)
@@ -151,6 +176,7 @@ class _Page:
         args: Args,
         choices: list[_Choice],
         loader: "Callable[[_Page, int, _Choice, int], None]",
+        folder: str,
     ):
         from roboarm_nmp.viewer.drawing import Drawing  # it imports Numba
 
@@ -159,6 +185,8 @@ class _Page:
         self.args = args
         self.choices = choices
         self._load = loader
+        self._folder = folder  # of dropped files
+        self._opened: tuple[Args, Simulation] | None = None  # of a dropped file
         self._work: queue.SimpleQueue = queue.SimpleQueue()
         self._drags = {}  # what is dragged -> function and arguments
         self._dragging = set()
@@ -166,6 +194,7 @@ class _Page:
         self.playing = True
         self.speed = args.speed
         self._message = ""
+        self._is_typing = False  # joint angles
         self._ended_at: float | None = None
         self._shown_at = 0.0
         self.drawing = Drawing(server, simulation)
@@ -183,10 +212,10 @@ class _Page:
         self._drags[what] = function, arguments
         self._work.put((None, ()))
 
-    def run(self):
-        """The loop. It ends with KeyboardInterrupt."""
+    def run(self) -> "tuple[Args, Simulation]":
+        """The loop, until another file is opened: returns the arguments and simulation of that."""
         due, changed = time.monotonic(), True
-        while True:
+        while self._opened is None:
             changed |= self._do_work(0.0 if changed else max(0.0, due - time.monotonic()))
             now = time.monotonic()
             if self.playing and not self.simulation.ended:
@@ -194,6 +223,7 @@ class _Page:
                 if now >= due:
                     due = max(due + 1 / (STEPS_PER_SECOND * self.speed), now)
                     self.simulation.step()
+                    self._is_typing = False
                     changed = True
             else:
                 due = now + IDLE_SECONDS
@@ -206,6 +236,7 @@ class _Page:
             if now > self._shown_at + STATUS_SECONDS:
                 self._shown_at = now
                 self._update_status()
+        return self._opened
 
     def _do_work(self, timeout):
         """Do what other threads have asked for; wait for the first of it. Returns whether any."""
@@ -251,8 +282,14 @@ class _Page:
     # --- Controls
 
     def _add_controls(self):
+        from roboarm_nmp.datasets.cloud_files import ENDINGS  # it imports Numba
+
         gui, simulation = self.server.gui, self.simulation
-        self._status = gui.add_markdown("")
+        self._status = gui.add_html("")
+        gui.add_html(DROP)
+        hint = f"{', '.join(SCENE_FILES)}; {', '.join(ENDINGS)}; or drop the file on the page"
+        upload = gui.add_upload_button("Open a scene or a point cloud", hint=hint)
+        upload.on_upload(self._file_chosen)
         with gui.add_folder("Run"):
             self._play = gui.add_button("Pause")
             self._play.on_click(lambda event: self.do(self._toggle))
@@ -263,6 +300,8 @@ class _Page:
             )
             self._speed.on_update(lambda event: self.do(self._set_speed))
             self._at_end = gui.add_dropdown("at the end", ("repeat", "next query", "stop"))
+            self._export = gui.add_button("Save the motion (GIF)")
+            self._export.on_click(lambda event: self.do(self._export_motion, event.client))
         with gui.add_folder("Query"):
             count = simulation.episodes.count(simulation.split)
             self._split = gui.add_dropdown(
@@ -321,6 +360,26 @@ class _Page:
             delete.on_click(lambda event: self.do(self._delete))
             self._file = gui.add_text("file", "my_scene.yaml")
             gui.add_button("Save the scene").on_click(lambda event: self.do(self._save))
+        with gui.add_folder("Joints"):
+            self._clearance = gui.add_markdown(NOT_POSED)
+            robot, self._sliders = simulation.robot, []
+            shown = np.clip(simulation.query.start, robot.lower, robot.upper)
+            for i, (lower, upper) in enumerate(zip(robot.lower, robot.upper, strict=True)):
+                slider = gui.add_slider(
+                    f"joint {i + 1}",
+                    min=float(lower),
+                    max=float(upper),
+                    step=0.001,
+                    initial_value=float(shown[i]),
+                )
+                slider.on_update(lambda event, i=i: self._slider_moved(event, i))
+                self._sliders.append(slider)
+            self._angles = gui.add_text("rad", "", multiline=True, hint="to copy, or to type")
+            self._angles.on_update(self._angles_typed)
+            pose = gui.add_button_group("go to the", ("start", "goal"))
+            pose.on_click(lambda event: self.do(self._go_to, event.target.value))
+            use = gui.add_button_group("make it the", ("start", "goal"))
+            use.on_click(lambda event: self.do(self._use_pose, event.target.value))
         scene = self.server.scene
         self._turns = self.args.goal_type == "pose"
         options = {"scale": 0.2, "disable_rotations": not self._turns, "depth_test": False}
@@ -363,16 +422,43 @@ class _Page:
             set_property(self._obstacle_gizmo, "wxyz", np.array((w, x, y, z)))
         set_property(self._number, "value", simulation.number)
         set_property(self._play, "label", "Pause" if self.playing else "Play")
+        if simulation.pose is not None:
+            self._update_joints()
+
+    def _configuration(self):
+        """Joint angles (n,), rad, of the sliders, or of the first arm."""
+        if self.simulation.pose is not None:
+            return self.simulation.pose.copy()
+        return self.simulation.robot.denormalise(self.simulation.arms[0].state)
+
+    def _update_joints(self):
+        """Set the sliders, the text of their angles and the clearance there."""
+        from roboarm_nmp.viewer.drawing import set_property
+        from roboarm_nmp.viewer.simulation import clearance
+
+        simulation, configuration = self.simulation, self._configuration()
+        for slider, angle in zip(self._sliders, configuration, strict=True):
+            set_property(slider, "value", float(np.clip(angle, slider.min, slider.max)))
+        if not self._is_typing:
+            text = ", ".join(f"{angle:.4f}" for angle in configuration)
+            set_property(self._angles, "value", text)
+        text = NOT_POSED
+        if simulation.pose is not None:
+            found = clearance(simulation.query.scene.at(simulation.arms[0].time), simulation.pose)
+            verdict = "**contact**" if found.distance < 0.0 else "**free**"
+            how = "deep in each other" if found.distance < 0.0 else "apart"
+            text = f"{verdict}: {found.nearest} are {100 * abs(found.distance):.1f} cm {how}"
+        set_property(self._clearance, "content", text)
 
     def _update_status(self):
         from roboarm_nmp.viewer.drawing import outcome, set_property
 
         simulation = self.simulation
         episodes = simulation.episodes
-        # As code, because Markdown makes a mail link of TASK@FILE.
-        lines = [f"**`{episodes.task}`**, {episodes.label(simulation.split, simulation.number)}"]
+        query = f"{episodes.label(simulation.split, simulation.number)}"
+        lines = [f"<b>{_escaped(episodes.task)}</b>, {query}"]
         if episodes.note:
-            lines.append(f"Random queries: {episodes.note}.")
+            lines.append(f"Random queries: {_escaped(episodes.note)}.")
         for arm in simulation.arms:
             mark = "▶"
             if arm.success and not arm.problem:
@@ -386,14 +472,94 @@ class _Page:
                 facts.append("an escape from a local minimum, or an approach path")
             elif arm.correction is not None:
                 facts.append(f"correction by the filter {arm.correction:.3f}")
-            lines.append(f"{mark} **{arm.name}**: {'; '.join(facts)}.")
+            lines.append(f"{mark} <b>{_escaped(arm.name)}</b>: {_escaped('; '.join(facts))}.")
         kinematic = any(arm.kinematic for arm in simulation.arms) and simulation.edited
         lines.append(KINEMATIC if kinematic else PHYSICS)
         if self._message:
-            lines.append(f"**{self._message}**")
-        set_property(self._status, "content", "\n\n".join(lines))
+            lines.append(f"<b>{_escaped(self._message)}</b>")
+        text = "".join(f'<p style="margin: 0 0 0.5em">{line}</p>' for line in lines)
+        style = "padding: 0.25em 0.75em; font-size: 0.875em; overflow-wrap: anywhere"
+        set_property(self._status, "content", f'<div style="{style}">{text}</div>')
+        if simulation.pose is None:
+            self._update_joints()
 
     # --- What controls do. Callbacks run in viser's threads, the rest in the loop.
+
+    def _say(self, message):
+        self._message = message
+
+    def _file_chosen(self, event):
+        """Open a file in this thread, while the page shows what it showed before."""
+        file = event.target.value
+        self.do(self._say, f"{file.name}: it is being opened")
+        try:
+            opened = _open_file(self.args, self._folder, file.name, file.content)
+        except (OSError, ValueError) as error:
+            self.do(self._say, str(error))
+        else:
+            self.do(setattr, self, "_opened", opened)
+
+    def _export_motion(self, client):
+        """Have a thread draw the arms' motion and send it to a page as a file."""
+        arms = [arm for arm in self.simulation.arms if len(arm.trace) > 1]
+        if not arms:
+            raise ValueError("no arm has moved yet: press Play first")
+        denormalise = self.simulation.robot.denormalise
+        motions = {arm.name: denormalise(np.array(arm.trace)) for arm in arms}
+        self._export.disabled = True
+        self._message = "The motion is being drawn."
+        arguments = client, self.simulation.query, motions, _direction(client.camera)
+        threading.Thread(target=self._draw_motion, args=arguments, daemon=True).start()
+
+    def _draw_motion(self, client, query, motions, direction):
+        episodes = self.simulation.episodes
+        try:
+            contents = motion_gif(episodes, query, motions, direction)
+            client.send_file_download("motion.gif", contents, save_immediately=True)
+            self.do(self._say, "The motion was saved as motion.gif.")
+        except (OSError, ValueError) as error:
+            self.do(self._say, str(error))
+        finally:
+            self._export.disabled = False
+
+    # --- Joints
+
+    def _slider_moved(self, event, joint):
+        if event.client is not None:
+            self._drag(("joint", joint), self._move_joint, joint, event.target.value)
+
+    def _move_joint(self, joint, angle):
+        configuration = self._configuration()
+        configuration[joint] = angle
+        self._pose(configuration)
+
+    def _angles_typed(self, event):
+        if event.client is not None:
+            self._drag("angles", self._type_angles, event.target.value)
+
+    def _type_angles(self, text):
+        self.playing = False
+        self._is_typing = True  # so that the text stays as it is
+        configuration = configuration_in("joint angles", text, self.simulation.robot)
+        self._pose(configuration, is_typing=True)
+
+    def _go_to(self, which):
+        self._pose(getattr(self.simulation.query, which))
+
+    def _pose(self, configuration, is_typing=False):
+        self.playing = False
+        self._is_typing = is_typing
+        robot = self.simulation.robot
+        self.simulation.pose = np.clip(np.array(configuration, float), robot.lower, robot.upper)
+
+    def _use_pose(self, which):
+        configuration = self._configuration()
+        self._is_typing = False
+        if which == "start":
+            self.simulation.set_start(configuration)
+        else:
+            self.simulation.set_goal(configuration)
+            self.simulation.pose = None
 
     def _toggle(self):
         self.playing = not self.playing
@@ -508,6 +674,68 @@ class _Page:
         path = self.simulation.save_scene(self._file.value)
         self._message = f"The scene was saved as {path}."
         print(f"{path}: written", flush=True)
+
+
+def _escaped(text):
+    """A text for HTML; dropped files are named without their temporary folder."""
+    folders = f"{re.escape(tempfile.gettempdir())}/{UPLOADS}[^/]*/[^/]*/"
+    return html.escape(re.sub(folders, "", text))
+
+
+def _direction(camera):
+    """Yaw and pitch, degrees, of a page's camera, as `roboarm show --camera` has them."""
+    x, y, z = np.subtract(camera.position, camera.look_at)
+    return math.degrees(math.atan2(x, -y)), -math.degrees(math.atan2(z, math.hypot(x, y)))
+
+
+def motion_gif(
+    episodes: Episodes,
+    query: Query,
+    motions: dict[str, np.ndarray],
+    direction: tuple[float, float] | None = None,
+) -> bytes:
+    """The contents of a GIF of motions in the scene of a query, as `roboarm show` draws them.
+
+    Args:
+        episodes: those of the query.
+        query: the `Query`.
+        motions: by name, joint angles (k, n), rad, one configuration per step.
+        direction: yaw and pitch of the view, degrees.
+    """
+    from roboarm_nmp.viewer.images import save_motions
+
+    env = envs.make(episodes.task, goal_type="combined")
+    names = list(motions) if len(motions) > 1 else []
+    with contextlib.closing(env), tempfile.TemporaryDirectory() as folder:
+        path, columns = Path(folder, "motion.gif"), list(motions.values())
+        left_out = episodes.left_out
+        save_motions(path, env, query, columns, names, camera=direction, left_out=left_out)
+        return path.read_bytes()
+
+
+def _open_file(args: Args, folder: str, name: str, contents: bytes) -> "tuple[Args, Simulation]":
+    """The arguments and the `Simulation` of a dropped file, which is put into the folder.
+
+    Raises OSError, ValueError: it cannot be used.
+    """
+    from roboarm_nmp.datasets.cloud_files import ENDINGS  # it imports Numba
+
+    name = Path(name).name
+    ending = Path(name).suffix.lower()
+    if ending not in (*SCENE_FILES, *ENDINGS):
+        raise ValueError(
+            f"{name}: a scene ends in {', '.join(SCENE_FILES)}, a point cloud in "
+            f"{', '.join(ENDINGS)}"
+        )
+    path = Path(tempfile.mkdtemp(dir=folder), name)  # a file of the same name may be in use
+    path.write_bytes(contents)
+    policies = tuple(policy for policy in args.policy if policy != DEMO)
+    task, cloud = str(path), None
+    if ending in ENDINGS:
+        _, robot = split_robot(str(args.task))
+        task, cloud = "no_obstacles" if robot is None else f"no_obstacles@{robot}", path
+    args = replace(args, task=task, cloud=cloud, policy=policies, demos=None, query=0)
+    return args, _simulation(args)
 
 
 def new_obstacle(kind: str, robot: Robot) -> Box | Cylinder | Sphere:
@@ -649,13 +877,29 @@ def _view(args):
     """Serve the page until Ctrl-C."""
     simulation = _simulation(args)
     server = _server(args.host, args.port)
+    url = f"http://{args.host}:{args.port}"
+    server.on_client_disconnect(
+        lambda client: print(f"a page was closed or lost; {url} opens it again", flush=True)
+    )
     try:
-        _serve(server, simulation, args)
+        with tempfile.TemporaryDirectory(prefix=UPLOADS) as folder:
+            page = _make_page(server, simulation, args, folder)
+            print(f"{url}  (Ctrl-C ends)", flush=True)
+            if args.open and not _open(url):
+                print(f"no browser could be opened: open {url} yourself", flush=True)
+            while True:
+                args, opened = page.run()
+                simulation.close()
+                simulation = opened
+                server.gui.reset()
+                server.scene.reset()
+                page = _make_page(server, simulation, args, folder)
     finally:
         _stop(server)
 
 
-def _serve(server, simulation, args):
+def _make_page(server, simulation, args, folder) -> _Page:
+    """The page of a simulation, whose policies are being made."""
     from roboarm_nmp.viewer.simulation import WaitingArm
 
     task = simulation.episodes.task
@@ -683,20 +927,13 @@ def _serve(server, simulation, args):
 
         threading.Thread(target=work, daemon=True).start()
 
-    page = _Page(server, simulation, args, offered, load)
+    page = _Page(server, simulation, args, offered, load, folder)
     _place_camera(server, simulation)
-    url = f"http://{args.host}:{args.port}"
-    server.on_client_disconnect(
-        lambda client: print(f"a page was closed or lost; {url} opens it again", flush=True)
-    )
-    print(f"{url}  (Ctrl-C ends)", flush=True)
-    if args.open and not _open(url):
-        print(f"no browser could be opened: open {url} yourself", flush=True)
     first = len(simulation.arms) - len(chosen)
     # Baselines first: they are ready at once.
     for index in sorted(range(len(chosen)), key=lambda i: chosen[i].policy not in BASELINES):
         load(page, first + index, chosen[index], args.seed, restart=True)
-    page.run()
+    return page
 
 
 def _open(url):

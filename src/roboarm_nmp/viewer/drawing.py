@@ -25,7 +25,7 @@ from roboarm_nmp.envs.scenes.primitives import (
     obstacle_at,
 )
 from roboarm_nmp.viewer.meshes import COARSE_MESH_CELL, MESH_CELL, Colour, arm_joints, link_meshes
-from roboarm_nmp.viewer.simulation import Arm, Simulation
+from roboarm_nmp.viewer.simulation import Arm, Simulation, clearance
 
 if TYPE_CHECKING:
     import viser
@@ -301,9 +301,12 @@ class Drawing:
     # --- The arm
 
     def _draw_arm(self, place, arm):
-        query, robot = self.simulation.query, self.simulation.robot
-        place.arm.set(robot.denormalise(arm.state))
-        place.arm.colour(arm.contacts.links)
+        query, robot, pose = self.simulation.query, self.simulation.robot, self.simulation.pose
+        place.arm.set(robot.denormalise(arm.state) if pose is None else pose)
+        links = arm.contacts.links
+        if pose is not None:
+            links = clearance(query.scene.at(arm.time), pose).links
+        place.arm.colour(links)
         place.start.show("start" in self.show)
         place.start.set(query.start)
         place.goal.show("goal" in self.show)
@@ -314,7 +317,8 @@ class Drawing:
             marker.position = pose[:3]
         place.axes.wxyz = _wxyz(pose[3:])
         # Seldom another text: a browser takes long to draw it.
-        set_property(place.label, "text", f"{arm.name}{_label(arm)}")
+        state = _label(arm) if pose is None else ": at the sliders' angles"
+        set_property(place.label, "text", f"{arm.name}{state}")
 
     # --- Overlays: redrawn while they are shown
 
@@ -397,6 +401,8 @@ class Drawing:
 
     def _contacts(self, place, arm):
         points = arm.contacts.points.astype(np.float32)
+        if self.simulation.pose is not None:
+            points = points[:0]
         handle = place.shapes.get("contacts")
         if handle is None and len(points):
             place.shapes["contacts"] = self._scene.add_point_cloud(
@@ -458,8 +464,9 @@ def _decoded(scene, arm):
 def _distance_lines(arm, simulation):
     """Lines (n, 2, 3), m, from each link to the nearest geometry, and their colours (n, 2, 3)."""
     scene = simulation.query.scene.at(arm.time)
+    state = arm.state if simulation.pose is None else scene.robot.normalise(simulation.pose)
     checker = find_geometry_source(arm.geometry_source or GROUND_TRUTH)(scene)
-    signed = checker.signed_distances(np.clip(arm.state, -1.0, 1.0), False, within=FAR)
+    signed = checker.signed_distances(np.clip(state, -1.0, 1.0), False, within=FAR)
     near = np.isfinite(signed.distance)
     distance, witness = signed.distance[near], signed.witness[near]
     points = np.stack([witness, witness - distance[:, None] * signed.normal[near]], axis=1)

@@ -2,6 +2,7 @@
 
     image = render_query(env, query)
     frames = render_configurations(env, query, trajectory.configurations)
+    save_motions("motion.gif", env, query, [trajectory.configurations])
 
 The arm is white, and the goal position of the end effector is a green ball. Where the goal is a
 configuration, a transparent green ghost of the arm shows it. Points of an `ObservedScene` are
@@ -17,7 +18,7 @@ from typing import NamedTuple
 
 import gymnasium
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from roboarm_nmp.datasets.queries import Query
 from roboarm_nmp.envs.arm_env import RoboArmEnv
@@ -27,6 +28,7 @@ from roboarm_nmp.envs.point_images import (
     PointImage,
     point_image,
 )
+from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.robots.rotations import matrix
@@ -34,6 +36,7 @@ from roboarm_nmp.envs.scenes.primitives import Box, ConvexHull, ObservedScene, S
 from roboarm_nmp.envs.world import image_array
 from roboarm_nmp.utils.bullet import pybullet as p
 from roboarm_nmp.utils.files import write_atomically
+from roboarm_nmp.utils.progress import progress_bar
 
 SIZE = (640, 480)
 OVERSAMPLING = 2  # the software renderer has jagged edges
@@ -54,6 +57,8 @@ LOWEST, HIGHEST = (-2.0, -2.0, -1.0), (2.0, 2.0, 2.0)
 SAME_DEPTH = 1e-4  # about a centimetre: where arm and ghost coincide, the arm is visible
 GHOST_COLOUR, GHOST_OPACITY = (0.25, 1.0, 0.4), 0.6
 ANIMATION_COLOURS = 128
+MAX_FRAMES = 60  # of an animation: at the default size, a file has about 0.3 MB
+PAUSE = 1.5  # s, at the end of an animation
 LEFT_OUT_RADIUS, TRACE_RADIUS = 0.002, 0.006  # m
 TRACE_COLOUR = (30, 90, 220)
 SWEPT_ARMS, SWEPT_OPACITY = 6, 0.3  # of an image of a motion
@@ -307,6 +312,51 @@ def _shoot(env: RoboArmEnv, camera: _Camera, size) -> _Shot:
         np.reshape(depth, (height, width)),
         np.reshape(bodies, (height, width)) == env.body,
     )
+
+
+def save_motions(
+    path: Path,
+    env: gymnasium.Env,
+    query: Query,
+    motions: Sequence[np.ndarray],
+    names: Sequence[str] = (),
+    size: tuple[int, int] = SIZE,
+    camera: tuple[float, float] | None = None,
+    left_out: np.ndarray | None = None,
+):
+    """Write an animation (.gif) of motions in the scene of a query, side by side.
+
+    Args:
+        motions: of each, joint angles (k, n), rad, one configuration per step of the environment.
+        names: of the motions, written above them.
+        env, query, size, camera, left_out: see `render_configurations`.
+    """
+    last = max(map(len, motions)) - 1
+    steps = [*range(0, last, max(1, math.ceil(last / MAX_FRAMES))), last]
+    shown = [np.minimum(steps, len(motion) - 1) for motion in motions]
+    configurations = [motion[numbers] for motion, numbers in zip(motions, shown, strict=True)]
+    images = render_configurations(
+        env,
+        query,
+        np.concatenate(configurations),
+        size,
+        camera=camera,
+        times=np.concatenate(shown) * STEP_SECONDS,
+        left_out=left_out,
+    )
+    number = len(steps) * len(motions)
+    images = list(progress_bar(images, "drawing", number, "frame", transient=True))
+    columns = [images[i : i + len(steps)] for i in range(0, number, len(steps))]
+    for name, column in zip(names, columns, strict=False):
+        column[:] = [_with_name(image, name) for image in column]
+    frames = [np.concatenate(row, axis=1) for row in zip(*columns, strict=True)]
+    save_animation(path, frames, [*np.diff(steps) * STEP_SECONDS, PAUSE])
+
+
+def _with_name(image: np.ndarray, name: str) -> np.ndarray:
+    captioned = Image.fromarray(image)
+    ImageDraw.Draw(captioned).text((10, 8), name, (0, 0, 0), font_size=16)
+    return np.asarray(captioned)
 
 
 def save_animation(path: Path, frames: Sequence[np.ndarray], seconds: Iterable[float]):

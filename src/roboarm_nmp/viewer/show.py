@@ -29,7 +29,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import tyro
 from PIL import Image
 
@@ -52,10 +51,7 @@ from roboarm_nmp.viewer.episodes import (
     task_episodes,
     trajectory_episodes,
 )
-from roboarm_nmp.viewer.images import SIZE, render_configurations, save_animation
-
-MAX_FRAMES = 60  # of an animation: at the default size, a file has about 0.3 MB
-PAUSE = 1.5  # s, at the end of an episode
+from roboarm_nmp.viewer.images import SIZE, render_configurations, save_motions
 
 
 @dataclass(kw_only=True)
@@ -234,20 +230,15 @@ def _animate(args: Args, episodes: Episodes, policy, arguments: dict):
         configurations = query.scene.robot.denormalise(states)
         outcome = _outcome(args, episodes, env, query, configurations, trajectory)
         if args.output is not None:
-            last = len(configurations) - 1
-            steps = [*range(0, last, max(1, math.ceil(last / MAX_FRAMES))), last]
-            images = render_configurations(
+            save_motions(
+                args.output,
                 env,
                 query,
-                configurations[steps],
-                args.size,
+                [configurations],
+                size=args.size,
                 camera=args.camera,
-                times=[step * STEP_SECONDS for step in steps],
                 left_out=episodes.left_out,
             )
-            frames = list(progress_bar(images, "drawing", len(steps), "frame", transient=True))
-            seconds = [*np.diff(steps) * STEP_SECONDS, PAUSE]
-            save_animation(args.output, frames, seconds)
             print(f"{args.output}: written, {args.task}, {outcome}")
     if args.save_trajectory is not None and trajectory is not None:
         save_trajectory(args.save_trajectory, trajectory)

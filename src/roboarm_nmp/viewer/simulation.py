@@ -414,6 +414,43 @@ class PolicyArm(Arm):
 # --- All arms
 
 
+class Clearance(NamedTuple):
+    """How far a configuration is from contact.
+
+    distance: m, between the arm and what is nearest, itself included; negative in contact.
+    links: PyBullet's indices of the links in contact.
+    nearest: the nearest link and what it is near to, in words.
+    """
+
+    distance: float
+    links: frozenset[int]
+    nearest: str
+
+
+def clearance(scene: Scene, configuration: np.ndarray) -> Clearance:
+    """The `Clearance` of joint angles (n,), rad, within the limits, in a static scene."""
+    # Here, because Numba takes a while to import.
+    from roboarm_nmp.envs.collision import checker
+    from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
+
+    robot = scene.robot
+    state = np.clip(robot.normalise(configuration), -1.0, 1.0)
+    signed = ground_truth_checker(scene).signed_distances(state)
+    row = int(signed.distance.argmin())
+    words = {
+        checker.TABLE: "the table",
+        checker.FLOOR: "the floor",
+        checker.ARM: "another link",
+        checker.POINT: "a point",
+        checker.NOTHING: "nothing",
+    }
+    geometry = int(signed.geometry[row])
+    near_to = words.get(geometry, f"obstacle {geometry}")
+    links = [robot.collision_links[i] for i in np.flatnonzero(signed.distance < 0.0)]
+    nearest = f"{robot.link_names[robot.collision_links[row]]} and {near_to}"
+    return Clearance(float(signed.distance[row]), frozenset(links), nearest)
+
+
 class Simulation:
     """Arms on one query, at first the first one of the episodes.
 
@@ -422,7 +459,8 @@ class Simulation:
         arms: list of `Arm`s.
         split, number: of the chosen query.
         query: the `Query` with all edits.
-        edited: whether goal or scene differ from those of the chosen query.
+        edited: whether start, goal or scene differ from those of the chosen query.
+        pose: joint angles (n,), rad, at which all arms are shown until the next step, if any.
 
     Raises:
         ValueError: there is no such query.
@@ -431,6 +469,7 @@ class Simulation:
     def __init__(self, episodes: Episodes, split: str | None = None, number: int = 0):
         self.episodes = episodes
         self.arms: list[Arm] = []
+        self.pose: np.ndarray | None = None
         self.select(split or episodes.splits[0], number)
 
     def add(self, arm: Arm):
@@ -461,11 +500,13 @@ class Simulation:
 
     def restart(self):
         """Put all arms at the start of the query, edited as it is, in the physics."""
+        self.pose = None
         for arm in self.arms:
             self._place(arm)
 
     def step(self):
         """One step of all arms whose episode is not over."""
+        self.pose = None
         for arm in self.arms:
             arm.step()
 
@@ -490,6 +531,13 @@ class Simulation:
     def _set_obstacles(self, obstacles):
         scene = replace(self.query.scene, obstacles=tuple(obstacles))
         self._edit(self.query._replace(scene=scene))
+
+    def set_start(self, start: np.ndarray):
+        """Another start, joint angles (n,), rad, clipped to the limits; all arms begin there."""
+        start = np.clip(start, self.robot.lower, self.robot.upper).astype(np.float32)
+        self.query = self.query._replace(start=start)
+        self.edited = True
+        self.restart()
 
     def set_goal(self, goal: np.ndarray):
         """Another goal, joint angles (n,), rad; clipped to the limits."""
