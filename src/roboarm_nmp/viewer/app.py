@@ -505,7 +505,7 @@ class _Page:
         if not arms:
             raise ValueError("no arm has moved yet: press Play first")
         denormalise = self.simulation.robot.denormalise
-        motions = {arm.name: denormalise(np.array(arm.trace)) for arm in arms}
+        motions = [(arm.name, denormalise(np.array(arm.trace))) for arm in arms]
         self._export.disabled = True
         self._message = "The motion is being drawn."
         arguments = client, self.simulation.query, motions, _direction(client.camera)
@@ -691,7 +691,7 @@ def _direction(camera):
 def motion_gif(
     episodes: Episodes,
     query: Query,
-    motions: dict[str, np.ndarray],
+    motions: list[tuple[str, np.ndarray]],
     direction: tuple[float, float] | None = None,
 ) -> bytes:
     """The contents of a GIF of motions in the scene of a query, as `roboarm show` draws them.
@@ -699,15 +699,17 @@ def motion_gif(
     Args:
         episodes: those of the query.
         query: the `Query`.
-        motions: by name, joint angles (k, n), rad, one configuration per step.
+        motions: of each, its name and joint angles (k, n), rad, one configuration per step.
         direction: yaw and pitch of the view, degrees.
     """
     from roboarm_nmp.viewer.images import save_motions
 
     env = envs.make(episodes.task, goal_type="combined")
-    names = list(motions) if len(motions) > 1 else []
+    names, columns = zip(*motions, strict=True)
+    if len(names) == 1:
+        names = ()
     with contextlib.closing(env), tempfile.TemporaryDirectory() as folder:
-        path, columns = Path(folder, "motion.gif"), list(motions.values())
+        path = Path(folder, "motion.gif")
         left_out = episodes.left_out
         save_motions(path, env, query, columns, names, camera=direction, left_out=left_out)
         return path.read_bytes()
