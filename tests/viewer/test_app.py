@@ -132,7 +132,7 @@ def drop(page, name, contents):
 def test_dropped_scene_and_cloud_are_opened_and_a_bad_file_loses_nothing(page):
     before = page.simulation.query
     bad = [
-        ("a.yaml", b"obstacles:\n  - bax: {}\n", "<b>a.yaml:2: unknown kind of obstacle bax"),
+        ("a.yaml", b"obstacles:\n  - bax: {}\n", ">a.yaml:2: unknown kind of obstacle bax"),
         ("a.docx", b"", "a.docx: a scene ends in .yaml"),
         ("a.npy", b"no", "a.npy"),
     ]
@@ -169,7 +169,7 @@ def test_sliders_show_contacts_and_make_starts_and_goals(page):
     assert np.allclose(page.simulation.query.start, configuration, atol=1e-4)
     page._angles_typed(event("0, -0.5, 0, -2, 0, 1.6"))
     do(page)
-    assert "joint angles must be 7 finite numbers" in page._status.content
+    assert "joint angles must be 7 finite numbers" in page._clearance.content
     page._angles_typed(event("0 -0.5 0 -2 0 1.6 0"))
     do(page)
     assert page._sliders[3].value == -2.0

@@ -81,6 +81,7 @@ IDLE_SECONDS = 0.5
 MAX_QUERY = 1_000_000  # of random queries, which have no end
 NEEDS_VISER = "the viewer needs viser: pip install viser"
 PHYSICS = "Physics, as in an evaluation."
+RECORDING = "A recorded motion, without forces."
 KINEMATIC = (
     "<b>Kinematic simulation</b>, because goal or scene were edited: no forces, and obstacles do "
     "not stop the arm. <i>Restart</i> runs the edited query in the physics."
@@ -92,7 +93,8 @@ NOT_POSED = "Move a joint: the arms stop, and are shown there."
 UPLOADS = "roboarm-view-"  # how the folders of dropped files begin
 # A file that is dropped anywhere on the page goes the way of the upload button, which takes none by
 # itself. The image is how a script comes into the page: viser has no other place for one.
-DROP = """<img style="display: none" src="data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAA\
+DROP = """<style>input[aria-haspopup=listbox] { text-overflow: ellipsis }</style>
+<img style="display: none" src="data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAA\
 AAABAAEAAAICTAEAOw==" onload="
     if (window.opensDroppedFiles) return;
     window.opensDroppedFiles = true;
@@ -195,6 +197,7 @@ class _Page:
         self.speed = args.speed
         self._message = ""
         self._is_typing = False  # joint angles
+        self._typing_error = ""
         self._ended_at: float | None = None
         self._shown_at = 0.0
         self.drawing = Drawing(server, simulation)
@@ -324,7 +327,9 @@ class _Page:
                 if arm.name == simulation.episodes.recording:
                     continue
                 labels = [choice.label for choice in self.choices]
-                menu = gui.add_dropdown(f"arm {index + 1}", labels, initial_value=arm.name)
+                menu = gui.add_dropdown(
+                    f"arm {index + 1}", labels, initial_value=arm.name, hint=arm.name
+                )
                 menu.on_update(lambda event, index=index: self._policy_chosen(event, index))
                 self._policies.append((index, menu))
             self._seed = gui.add_number("seed", self.args.seed, min=0, max=2**32 - 1, step=1)
@@ -443,6 +448,8 @@ class _Page:
             text = ", ".join(f"{angle:.4f}" for angle in configuration)
             set_property(self._angles, "value", text)
         text = NOT_POSED
+        if self._is_typing and self._typing_error:
+            text = self._typing_error
         if simulation.pose is not None:
             found = clearance(simulation.query.scene.at(simulation.arms[0].time), simulation.pose)
             verdict = "**contact**" if found.distance < 0.0 else "**free**"
@@ -473,10 +480,14 @@ class _Page:
             elif arm.correction is not None:
                 facts.append(f"correction by the filter {arm.correction:.3f}")
             lines.append(f"{mark} <b>{_escaped(arm.name)}</b>: {_escaped('; '.join(facts))}.")
-        kinematic = any(arm.kinematic for arm in simulation.arms) and simulation.edited
-        lines.append(KINEMATIC if kinematic else PHYSICS)
+        if all(arm.recording is not None for arm in simulation.arms):
+            lines.append(RECORDING)
+        elif simulation.edited and any(arm.kinematic for arm in simulation.arms):
+            lines.append(KINEMATIC)
+        else:
+            lines.append(PHYSICS)
         if self._message:
-            lines.append(f"<b>{_escaped(self._message)}</b>")
+            lines.append(f'<b style="color: #c03020">{_escaped(self._message)}</b>')
         text = "".join(f'<p style="margin: 0 0 0.5em">{line}</p>' for line in lines)
         style = "padding: 0.25em 0.75em; font-size: 0.875em; overflow-wrap: anywhere"
         set_property(self._status, "content", f'<div style="{style}">{text}</div>')
@@ -540,7 +551,13 @@ class _Page:
     def _type_angles(self, text):
         self.playing = False
         self._is_typing = True  # so that the text stays as it is
-        configuration = configuration_in("joint angles", text, self.simulation.robot)
+        self.simulation.pose = None
+        try:
+            configuration = configuration_in("joint angles", text, self.simulation.robot)
+        except ValueError as error:  # shown beside the text
+            self._typing_error = str(error)
+            return
+        self._typing_error = ""
         self._pose(configuration, is_typing=True)
 
     def _go_to(self, which):
@@ -605,6 +622,7 @@ class _Page:
 
     def _policy_chosen(self, event, index):
         if event.client is not None:
+            event.target.hint = event.target.value  # the list cuts long names
             self._load_choice(index, event.target.value)
 
     def _seed_chosen(self, event):
@@ -895,6 +913,7 @@ def _view(args):
                 simulation = opened
                 server.gui.reset()
                 server.scene.reset()
+                server.gui.main_panel.dock_right()
                 page = _make_page(server, simulation, args, folder)
     finally:
         _stop(server)

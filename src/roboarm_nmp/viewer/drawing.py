@@ -4,6 +4,7 @@ Every arm has its own copy of the scene, `SPACING` beside the last one. The arm'
 frames, of which only the joints move.
 """
 
+import textwrap
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -43,7 +44,8 @@ TOUCHABLE_COLOUR = (150, 120, 170)
 START_COLOUR, GOAL_COLOUR, CONTACT_COLOUR = (150, 150, 165), (60, 190, 90), (230, 30, 30)
 DECODED_COLOUR, SWEPT_COLOUR = (150, 60, 200), (150, 190, 240)
 SWEPT_ARMS = 8
-POINT_SIZES = {"left_out": 0.004}  # m; 0.012 of others
+POINT_SIZES = {"left_out": 0.004}  # m, of the radius, as viser draws it; 0.012 of others
+NAME_WIDTH = 36  # letters in a line of a label
 WANTED_COLOUR, FILTERED_COLOUR = (130, 130, 130), (20, 110, 230)
 TRACE_COLOUR = (235, 150, 40)
 NEAR, FAR = 0.05, 0.3  # m: link distances are red up to the first, and not drawn beyond the second
@@ -301,11 +303,13 @@ class Drawing:
     # --- The arm
 
     def _draw_arm(self, place, arm):
-        query, robot, pose = self.simulation.query, self.simulation.robot, self.simulation.pose
-        place.arm.set(robot.denormalise(arm.state) if pose is None else pose)
-        links = arm.contacts.links
-        if pose is not None:
-            links = clearance(query.scene.at(arm.time), pose).links
+        query, robot, posed = self.simulation.query, self.simulation.robot, self.simulation.pose
+        configuration, links = posed, arm.contacts.links
+        if configuration is None:
+            configuration = robot.denormalise(arm.state)
+        else:
+            links = clearance(query.scene.at(arm.time), configuration).links
+        place.arm.set(configuration)
         place.arm.colour(links)
         place.start.show("start" in self.show)
         place.start.set(query.start)
@@ -317,8 +321,9 @@ class Drawing:
             marker.position = pose[:3]
         place.axes.wxyz = _wxyz(pose[3:])
         # Seldom another text: a browser takes long to draw it.
-        state = _label(arm) if pose is None else ": at the sliders' angles"
-        set_property(place.label, "text", f"{arm.name}{state}")
+        state = _label(arm) if posed is None else "at the sliders' angles"
+        text = f"{textwrap.fill(arm.name, NAME_WIDTH)}\n{state}".rstrip()
+        set_property(place.label, "text", text)
 
     # --- Overlays: redrawn while they are shown
 
@@ -372,9 +377,14 @@ class Drawing:
             return
         points, size = find(scene, arm), POINT_SIZES.get(name, 0.012)
         if name == "observed" and isinstance(scene, ObservedScene):
-            size = 2 * scene.point_radius
+            size = max(scene.point_radius, POINT_SIZES["left_out"])
         handle = self._scene.add_point_cloud(
-            f"{place.name}/{name}", points, colour, point_size=size, point_shape="circle"
+            f"{place.name}/{name}",
+            points,
+            colour,
+            point_size=size,
+            point_shape="circle",
+            point_shading="gradient",
         )
         place.shapes[name] = scene, handle
 
@@ -432,12 +442,12 @@ def outcome(arm: Arm) -> str:
 
 
 def _label(arm):
-    contact = ", with contact" if arm.contact_steps else ""
     if arm.problem is not None and arm.ended:
-        return f": {arm.problem}"
+        return textwrap.fill(arm.problem, NAME_WIDTH)
+    contact = "with contact" if arm.contact_steps else "no contact"
     if arm.ended:
-        return f": goal {'' if arm.success else 'not '}reached{contact or ', no contact'}"
-    return contact
+        return f"goal {'' if arm.success else 'not '}reached, {contact}"
+    return contact if arm.contact_steps else ""
 
 
 def _shape(body):

@@ -25,7 +25,7 @@ from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.files import save_scene
-from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.scenes.primitives import ObservedScene, Scene
 from roboarm_nmp.envs.world import World
 from roboarm_nmp.evaluation.rollout import Episode, Trajectory
 from roboarm_nmp.policies.baselines import CHECKING, PLANNERS
@@ -85,6 +85,20 @@ def contacts_in(world: World) -> Contacts:
             if other_body == world.body:
                 links.add(other_link)
     return Contacts(np.array(points).reshape(-1, 3), frozenset(links))
+
+
+def contacts_with_points(world: World, scene: Scene, configuration: np.ndarray) -> Contacts:
+    """As `contacts_in`, with links at the points of an `ObservedScene`, which no world has.
+
+    Args:
+        world: the `World`.
+        scene: its scene.
+        configuration: joint angles (n,), rad, of the step.
+    """
+    contacts = contacts_in(world)
+    if not isinstance(scene, ObservedScene):
+        return contacts
+    return contacts._replace(links=contacts.links | clearance(scene, configuration).links)
 
 
 class Arm:
@@ -210,8 +224,9 @@ class RecordedArm(Arm):
         self.steps += 1
         self.state = self.recording[self.steps]
         self.trace.append(self.state)
-        self._world.in_collision(self._world.robot.denormalise(self.state), self.time)
-        self.contacts = contacts_in(self._world)
+        configuration = self._world.robot.denormalise(self.state)
+        self._world.in_collision(configuration, self.time)
+        self.contacts = contacts_with_points(self._world, self._world.scene, configuration)
         self.contact_steps += self.in_contact
         self.ended = self.success = self.steps == len(self.recording) - 1
 
@@ -395,8 +410,10 @@ class PolicyArm(Arm):
         self.ms_per_action = 1000 * self._seconds / self.steps
         self.state = self._observed_state()
         self.trace.append(self.state)
-        self.contacts = contacts_in(self._arm_env.world)
-        self.contact_steps += self._episode.info["collision"]
+        scene, configuration = self._arm_env.scene, self._arm_env.robot.denormalise(self.state)
+        self.contacts = contacts_with_points(self._arm_env.world, scene, configuration)
+        is_observed = isinstance(scene, ObservedScene)
+        self.contact_steps += self.in_contact if is_observed else self._episode.info["collision"]
         self.ended = self._episode.ended
         self.success = self._episode.info["is_success"]
 
