@@ -108,6 +108,61 @@ def place_block(states, chain, frames):
 
 
 @uncounted
+def place_speeds(rates, chain, frames, speeds):
+    """Write how fast the frames of `place_block` move: rows 6 f to 6 f + 5, of origin and rotation.
+
+    `rates`: float32 (f,), m or rad per unit of time of each frame's joint.
+    """
+    for i in range(6):
+        store(speeds, i * WIDTH, spread(F32(0.0)))
+    for f in range(1, chain.shape[0]):
+        parent = int(chain[f, PARENT])
+        row, here = 6 * WIDTH * f, 12 * WIDTH * f
+        x, y, z = rotation_speeds(speeds, parent)
+        # Along the joint's axis, or about it.
+        ax = load(frames, here + 2 * WIDTH) * rates[f]
+        ay = load(frames, here + 5 * WIDTH) * rates[f]
+        az = load(frames, here + 8 * WIDTH) * rates[f]
+        px, py = load(frames, here + 9 * WIDTH), load(frames, here + 10 * WIDTH)
+        pz = load(frames, here + 11 * WIDTH)
+        u, v, w = speeds_of(frames, speeds, parent, px, py, pz)
+        if chain[f, PRISMATIC] != F32(0.0):
+            u, v, w = u + ax, v + ay, w + az
+        else:
+            x, y, z = x + ax, y + ay, z + az
+        store(speeds, row, u)
+        store(speeds, row + WIDTH, v)
+        store(speeds, row + 2 * WIDTH, w)
+        store(speeds, row + 3 * WIDTH, x)
+        store(speeds, row + 4 * WIDTH, y)
+        store(speeds, row + 5 * WIDTH, z)
+
+
+@uncounted
+def rotation_speeds(speeds, f):
+    row = 6 * WIDTH * f
+    return (
+        load(speeds, row + 3 * WIDTH),
+        load(speeds, row + 4 * WIDTH),
+        load(speeds, row + 5 * WIDTH),
+    )
+
+
+@uncounted
+def speeds_of(frames, speeds, f, x, y, z):
+    """How fast a point at (x, y, z), in the base's frame, moves with frame f."""
+    here, row = 12 * WIDTH * f, 6 * WIDTH * f
+    x = x - load(frames, here + 9 * WIDTH)
+    y = y - load(frames, here + 10 * WIDTH)
+    z = z - load(frames, here + 11 * WIDTH)
+    a, b, c = rotation_speeds(speeds, f)
+    u = fused(b, z, load(speeds, row)) - c * y
+    v = fused(c, x, load(speeds, row + WIDTH)) - a * z
+    w = fused(a, y, load(speeds, row + 2 * WIDTH)) - b * x
+    return u, v, w
+
+
+@uncounted
 def _combined(rx, ry, rz, x, y, z):
     return fused(rx, spread(x), fused(ry, spread(y), rz * z))
 

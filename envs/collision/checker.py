@@ -45,7 +45,7 @@ from roboarm_nmp.envs.collision.edge_kernels import motion_batch, single_motion
 from roboarm_nmp.envs.collision.grid_kernels import distance_grid
 from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, group_points, world_shapes
 from roboarm_nmp.envs.collision.motion_kernels import free_batch
-from roboarm_nmp.envs.collision.search_kernels import finish_path, plan_path
+from roboarm_nmp.envs.collision.search_kernels import plan_path
 from roboarm_nmp.envs.collision.spheres import block_arm, grid_reach
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.robot import Robot
@@ -243,7 +243,10 @@ class CollisionChecker:
         clear = np.empty(batch, dtype=np.bool_)
         starts = np.ascontiguousarray(starts.reshape(-1, self.robot.num_joints))
         ends = np.ascontiguousarray(ends.reshape(-1, self.robot.num_joints))
-        clear_batch(starts, ends, rule, endpoints, self._arm, self._world, clear.reshape(-1))
+        arm32, grid = self._blocks
+        clear_batch(
+            starts, ends, rule, endpoints, self._arm, arm32, self._world, grid, clear.reshape(-1)
+        )
         return clear
 
     def motion_checks(
@@ -349,6 +352,7 @@ class CollisionChecker:
         checks: int = 0,
         max_checks: float = math.inf,
         chords: int = 40,
+        found: np.ndarray | None = None,
     ) -> tuple[np.ndarray | None, int]:
         """`find_path` for planners, with rules that change during the search.
 
@@ -359,12 +363,17 @@ class CollisionChecker:
             checks: how many there were before.
             max_checks: about the number of checks at which the search ends.
             reach, chords: as for `find_path`.
+            found: (k, n), a path by another planner, which is only shortened. The answer is None if
+                it touches something between its states.
         """
         if bounds is None:
             bounds = np.array([[-1.0], [1.0]]) * np.ones(len(start))
+        if found is None:
+            found = np.empty((0, len(start)))
         arm32, grid = self._blocks
         problem = tuple(rules), self._arm, arm32, self._world, grid
         path, checks = plan_path(
+            found,
             np.ascontiguousarray(start),
             np.ascontiguousarray(goals),
             np.uint64(seed % 2**64),
@@ -375,16 +384,6 @@ class CollisionChecker:
             int(min(max_checks, 2**62)),
             problem,
         )
-        return (path if len(path) else None), checks
-
-    def finish_path(self, path: np.ndarray, rules: Rules, seed: int, chords: int):
-        """A path (k, n) of another planner, shortened, and the number of checks.
-
-        Nothing touches anywhere on it; None where the path touches something between its states.
-        """
-        arm32, grid = self._blocks
-        problem = tuple(rules), self._arm, arm32, self._world, grid
-        path, checks = finish_path(path, np.uint64(seed % 2**64), chords, problem)
         return (path if len(path) else None), checks
 
     def end_distances(self, states: np.ndarray, within: float) -> np.ndarray:

@@ -36,6 +36,7 @@ from roboarm_nmp.envs.collision.gjk_kernels import (
     write_body_row,
     write_sharp_row,
 )
+from roboarm_nmp.envs.collision.motion_kernels import is_free
 from roboarm_nmp.utils.numba_cache import compiled
 
 _NEAR_SLACK = 1e-5  # m: more than rounding the arm to float32 changes
@@ -424,15 +425,28 @@ def end_distances(states, within, links, arm, world):
     Infinite beyond `within`. `links`: those that may collide.
     """
     m, n = states.shape
-    distance, geometry = np.empty((m, links)), np.empty((m, links), np.int64)
-    normal, witness = np.empty((m, links, 3)), np.empty((m, links, 3))
-    gradient = np.empty((m, links, n))
+    distance, geometry = np.empty((1, links)), np.empty((1, links), np.int64)
+    normal, witness = np.empty((1, links, 3)), np.empty((1, links, 3))
+    gradient = np.empty((1, links, n))
     least = np.full((2, m), np.inf)
-    for k in range(2):
-        signed_distances_batch(
-            states, k == 0, within, arm, world, distance, normal, witness, gradient, geometry
-        )
-        for i in range(m):
-            for link in range(links):
-                least[k, i] = min(least[k, i], distance[i, link])
+    rule, no_endpoints = np.array([within, 0.0, 0.0, 0.0]), np.empty((0, n + 1))
+    memory, state = working_memory(arm[0], arm[1]), np.empty((1, n))
+    for i in range(m):
+        if is_free(states[i], rule, no_endpoints, arm, world, memory):  # which is much quicker
+            continue
+        state[0] = states[i]
+        for k in range(2):
+            signed_distances_batch(
+                state,
+                k == 0,
+                within,
+                arm,
+                world,
+                distance,
+                normal,
+                witness,
+                gradient,
+                geometry,
+            )
+            least[k, i] = distance.min()
     return least

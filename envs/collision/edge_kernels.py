@@ -40,22 +40,23 @@ from roboarm_nmp.envs.collision.lanes_kernels import (
     less,
     load,
     lowest,
+    root,
     spread,
     store,
 )
-from roboarm_nmp.envs.collision.motion_kernels import free_batch, is_apart_from_points
+from roboarm_nmp.envs.collision.motion_kernels import free_batch, is_apart_from_points, margin_of
 from roboarm_nmp.utils.numba_cache import compiled, uncounted
 
 # What is undecided in a block: a body and a shape; or one of these and a pair's index, or a body.
-_PAIR, _CLOUD = -1, -2
+PAIR, CLOUD = -1, -2
 _HIT = -1
 
 
 @compiled
-def block_memory(arm, world):
+def block_memory(arm, arm32, world):
     """Working memory of `check_motion`, for an arm in a world.
 
-    `axes`, for `gjk_kernels.apart_by`, are remembered from motion to motion.
+    `axes`, for `gjk_kernels.was_apart`, are remembered from motion to motion.
     """
     chain, bodies, pairs, _, _ = arm
     rows = world[0]
@@ -68,6 +69,9 @@ def block_memory(arm, world):
         np.empty((size, 3), np.int64),  # undecided
         np.zeros((size, 3)),  # axes
         np.empty(chain.shape[0]),  # one state
+        np.zeros(bodies.shape[0] * WIDTH + pairs.shape[0], np.float32),  # moves
+        np.empty(arm32[2].shape[0] * 3 * WIDTH, np.float32),  # centres of outer spheres
+        np.empty(bodies.shape[0], np.bool_),  # of which bodies they are written
     )
     return block, (rounded, columns), working_memory(chain, bodies)
 
@@ -80,8 +84,7 @@ def check_motion(start, end, ends_known, rule, endpoint_margins, arm, arm32, wor
     `CollisionChecker.is_motion_free`, and up to 16 are checked at once.
     """
     block, shapes, single = memory
-    chain32, bodies32 = arm32[0], arm32[1]
-    frames, centres, states, undecided, _, _ = block
+    states, moves = block[2], block[6]
     n = start.shape[0]
     squared = 0.0
     for j in range(n):
@@ -95,24 +98,12 @@ def check_motion(start, end, ends_known, rule, endpoint_margins, arm, arm32, wor
         place_states(start, end, first, blocks, last, pieces, states)
         checked = min(checked + WIDTH, last)
         margins = margins_of(states, n, rule[0], rule[2], endpoint_margins)
-        place_block(states, chain32, frames)
-        for k in range(bodies32.shape[0]):
-            x, y, z = points_of(
-                frames,
-                int(bodies32[k, FRAME]),
-                bodies32[k, CENTRE],
-                bodies32[k, CENTRE + 1],
-                bodies32[k, CENTRE + 2],
-            )
-            store(centres, 3 * k * WIDTH, x)
-            store(centres, (3 * k + 1) * WIDTH, y)
-            store(centres, (3 * k + 2) * WIDTH, z)
-        count = _against_shapes(margins, rule, arm32, world[0], shapes, block)
+        place_bodies(arm32, block)
+        count = list_near(
+            margins, rule[0], rule[1], True, moves, arm[2], arm32, world, shapes, grid, block
+        )
         if count == _HIT:
             return -checked
-        count = _against_links(margins, count, arm[2], arm32, block)
-        if grid[0].shape[0] > 0:
-            count = _against_points(margins, count, rule, arm32, world, grid, block)
         if count > 0 and not _are_apart(
             start, end, first, blocks, last, pieces, count, rule, endpoint_margins, arm, world,
             block, single,
@@ -122,26 +113,92 @@ def check_motion(start, end, ends_known, rule, endpoint_margins, arm, arm32, wor
 
 
 @uncounted
-def _against_shapes(margins, rule, arm32, rows, shapes, block):
+def place_bodies(arm32, block):
+    """Write the frames and the bodies' centres of a block's states."""
+    bodies = arm32[1]
+    frames, centres, states = block[0], block[1], block[2]
+    place_block(states, arm32[0], frames)
+    for k in range(bodies.shape[0]):
+        x, y, z = points_of(
+            frames,
+            int(bodies[k, FRAME]),
+            bodies[k, CENTRE],
+            bodies[k, CENTRE + 1],
+            bodies[k, CENTRE + 2],
+        )
+        store(centres, 3 * k * WIDTH, x)
+        store(centres, (3 * k + 1) * WIDTH, y)
+        store(centres, (3 * k + 2) * WIDTH, z)
+
+
+@uncounted
+def list_near(margins, most, clearance, hits, moves, pairs, arm32, world, shapes, grid, block):
+    """List what spheres do not separate by its margin in the states of `place_bodies`.
+
+    Args:
+        margins: lanes, m; `most` is what none of them exceeds.
+        clearance: m, from the scene, in addition.
+        hits: whether to stop where a sphere in a body is nearer than the margin.
+        moves: float32, m: what is added to the margins of each body, 16 numbers each; then those of
+            each pair.
+
+    Returns: how many are undecided; -1 where there is a hit.
+    """
+    block[8][:] = False
+    count = _against_shapes(
+        margins, F32(most + clearance), F32(clearance), hits, moves, arm32, world[0], shapes, block
+    )
+    if count == _HIT:
+        return count
+    count = _against_links(margins, count, moves, pairs, arm32, block)
+    if grid[0].shape[0] > 0:
+        count = _against_points(margins, count, F32(clearance), moves, arm32, world, grid, block)
+    return count
+
+
+@uncounted
+def _place_spheres(k, arm32, block):
+    """Write the centres of a body's outer spheres in the states of a block, once."""
+    _, bodies, outer, outer_begin, _, _ = arm32
+    frames, spheres, are_placed = block[0], block[7], block[8]
+    if are_placed[k]:
+        return
+    are_placed[k] = True
+    f = int(bodies[k, FRAME])
+    for i in range(outer_begin[k], outer_begin[k + 1]):
+        x, y, z = points_of(frames, f, outer[i, 0], outer[i, 1], outer[i, 2])
+        store(spheres, 3 * i * WIDTH, x)
+        store(spheres, (3 * i + 1) * WIDTH, y)
+        store(spheres, (3 * i + 2) * WIDTH, z)
+
+
+@uncounted
+def _place_of(points, i):
+    """Where point i is in the states of a block."""
+    row = 3 * i * WIDTH
+    return load(points, row), load(points, row + WIDTH), load(points, row + 2 * WIDTH)
+
+
+@uncounted
+def _against_shapes(margins, most, clearance, hits, moves, arm32, rows, shapes, block):
     """List the bodies and shapes that spheres do not settle; their number, or `_HIT`."""
     _, bodies, outer, outer_begin, inner, inner_begin = arm32
     rounded, columns = shapes
-    frames, centres, _, undecided, _, _ = block
+    frames, centres, _, undecided, _, _, _, spheres, _ = block
     capacity = columns.shape[0] // ROW
     touching = rows.shape[1] > ROW
-    margins = margins + F32(rule[1])
     count = 0
     for k in range(bodies.shape[0] - 1, -1, -1):  # the hand first: it moves most
         if bodies[k, LINK_ROW] < F32(0.0):  # the base stands where it stands
             continue
         f = int(bodies[k, FRAME])
-        cx, cy = load(centres, 3 * k * WIDTH), load(centres, (3 * k + 1) * WIDTH)
-        cz = load(centres, (3 * k + 2) * WIDTH)
+        cx, cy, cz = _place_of(centres, k)
         # A ball around the body in all 16 states.
         mx, my, mz = lane(cx, WIDTH // 2), lane(cy, WIDTH // 2), lane(cz, WIDTH // 2)
-        moved = largest(squared_length(cx - mx, cy - my, cz - mz))
-        reach = F32(rule[0] + rule[1]) + bodies[k, ROUNDING] + bodies[k, RADIUS]
-        reach += F32(math.sqrt(moved)) + F32(1e-6)
+        move = load(moves, k * WIDTH)
+        moved = largest(root(squared_length(cx - mx, cy - my, cz - mz)) + move)
+        reach = most + bodies[k, ROUNDING] + bodies[k, RADIUS] + moved + F32(1e-6)
+        of_body = margins + move + (clearance + bodies[k, ROUNDING])
         for begin in range(0, capacity, WIDTH):
             near = rows_near(columns, capacity, begin, mx, my, mz, reach)
             while near != 0:
@@ -150,87 +207,91 @@ def _against_shapes(margins, rule, arm32, rows, shapes, block):
                 if touching and rows[j, ROW + k] != 0.0:
                     continue
                 slack = rounded[j, 17]
-                gaps = margins + (rounded[j, 16] + bodies[k, ROUNDING])
+                gaps = of_body + rounded[j, 16]
                 reaches = gaps + (bodies[k, RADIUS] + slack)
                 left = less(squared_gaps(rounded, j, cx, cy, cz), reaches * reaches)
                 if left == 0:
                     continue
-                if rounded[j, 0] != F32(LINK):
+                _place_spheres(k, arm32, block)
+                close = 0
+                for i in range(outer_begin[k], outer_begin[k + 1]):
+                    x, y, z = _place_of(spheres, i)
+                    within = gaps + (outer[i, 3] + slack)
+                    close |= less(squared_gaps(rounded, j, x, y, z), within * within)
+                    if left & ~close == 0:
+                        break
+                left &= close
+                if left == 0:
+                    continue
+                if hits and rounded[j, 0] != F32(LINK):
                     possible = left & less(spread(F32(0.0)), gaps)
                     for i in range(inner_begin[k], inner_begin[k + 1]):
                         x, y, z = points_of(frames, f, inner[i, 0], inner[i, 1], inner[i, 2])
                         within = larger(gaps + (inner[i, 3] - slack), spread(F32(0.0)))
-                        hits = less(squared_gaps(rounded, j, x, y, z), within * within)
-                        if hits & possible != 0:
+                        if possible & less(squared_gaps(rounded, j, x, y, z), within * within) != 0:
                             return _HIT
-                close = 0
-                for i in range(outer_begin[k], outer_begin[k + 1]):
-                    x, y, z = points_of(frames, f, outer[i, 0], outer[i, 1], outer[i, 2])
-                    within = gaps + (outer[i, 3] + slack)
-                    close |= less(squared_gaps(rounded, j, x, y, z), within * within)
-                left &= close
-                if left != 0:
-                    undecided[count, 0], undecided[count, 1], undecided[count, 2] = k, j, left
-                    count += 1
+                undecided[count, 0], undecided[count, 1], undecided[count, 2] = k, j, left
+                count += 1
     return count
 
 
 @uncounted
-def _against_links(margins, count, pairs, arm32, block):
+def _against_links(margins, count, moves, pairs, arm32, block):
     """Add the pairs of links that spheres do not settle to the list of `count`; its length."""
     _, bodies, outer, outer_begin, _, _ = arm32
-    frames, centres, _, undecided, _, _ = block
+    _, centres, _, undecided, _, _, _, spheres, _ = block
+    of_pairs = bodies.shape[0] * WIDTH
     for p in range(pairs.shape[0]):
         a, b = pairs[p, 0], pairs[p, 1]
-        ax, ay = load(centres, 3 * a * WIDTH), load(centres, (3 * a + 1) * WIDTH)
-        az = load(centres, (3 * a + 2) * WIDTH)
-        bx, by = load(centres, 3 * b * WIDTH), load(centres, (3 * b + 1) * WIDTH)
-        bz = load(centres, (3 * b + 2) * WIDTH)
-        gaps = margins + (bodies[a, ROUNDING] + bodies[b, ROUNDING])
+        ax, ay, az = _place_of(centres, a)
+        bx, by, bz = _place_of(centres, b)
+        gaps = margins + (bodies[a, ROUNDING] + bodies[b, ROUNDING] + moves[of_pairs + p])
         reaches = gaps + (bodies[a, RADIUS] + bodies[b, RADIUS])
         left = less(squared_length(ax - bx, ay - by, az - bz), reaches * reaches)
         if left == 0:
             continue
-        fa, fb = int(bodies[a, FRAME]), int(bodies[b, FRAME])
+        _place_spheres(a, arm32, block)
+        _place_spheres(b, arm32, block)
         close = 0
         for i in range(outer_begin[b], outer_begin[b + 1]):
-            x, y, z = points_of(frames, fb, outer[i, 0], outer[i, 1], outer[i, 2])
+            x, y, z = _place_of(spheres, i)
             reaches = gaps + (outer[i, 3] + bodies[a, RADIUS])
-            if less(squared_length(x - ax, y - ay, z - az), reaches * reaches) & left == 0:
+            near = less(squared_length(x - ax, y - ay, z - az), reaches * reaches)
+            if near & left & ~close == 0:
                 continue
             for n in range(outer_begin[a], outer_begin[a + 1]):
-                u, v, w = points_of(frames, fa, outer[n, 0], outer[n, 1], outer[n, 2])
+                u, v, w = _place_of(spheres, n)
                 reaches = gaps + (outer[i, 3] + outer[n, 3])
                 close |= less(squared_length(u - x, v - y, w - z), reaches * reaches)
         left &= close
         if left != 0:
-            undecided[count, 0], undecided[count, 1], undecided[count, 2] = _PAIR, p, left
+            undecided[count, 0], undecided[count, 1], undecided[count, 2] = PAIR, p, left
             count += 1
     return count
 
 
 @uncounted
-def _against_points(margins, count, rule, arm32, world, grid, block):
+def _against_points(margins, count, clearance, moves, arm32, world, grid, block):
     """Add the bodies that may be near a point of the cloud to the list of `count`; its length."""
     _, bodies, outer, outer_begin, _, _ = arm32
-    frames, _, states, undecided, _, _ = block
+    _, _, states, undecided, _, _, _, spheres, _ = block
     near, numbers, place = grid
     ball = world[3]
     nx, ny, nz = numbers[0], numbers[1], numbers[2]
     own = states[states.shape[0] - 3 * WIDTH :]
-    margins = margins + F32(rule[1] + ball[0, 16])
+    margins = margins + (clearance + F32(ball[0, 16]))
     for k in range(bodies.shape[0] - 1, -1, -1):
         if bodies[k, LINK_ROW] < F32(0.0):
             continue
+        gaps = margins + load(moves, k * WIDTH) + bodies[k, ROUNDING]
+        _place_spheres(k, arm32, block)
         left = 0
         for i in range(outer_begin[k], outer_begin[k + 1]):
-            x, y, z = points_of(
-                frames, int(bodies[k, FRAME]), outer[i, 0], outer[i, 1], outer[i, 2]
-            )
+            x, y, z = _place_of(spheres, i)
             store(own, 0, (x - place[0]) * place[3])
             store(own, WIDTH, (y - place[1]) * place[3])
             store(own, 2 * WIDTH, (z - place[2]) * place[3])
-            reaches = margins + (bodies[k, ROUNDING] + outer[i, 3])
+            reaches = gaps + outer[i, 3]
             for n in range(WIDTH):
                 u, v, w = own[n], own[WIDTH + n], own[2 * WIDTH + n]
                 distance = place[4]  # outside of the grid
@@ -239,7 +300,7 @@ def _against_points(margins, count, rule, arm32, world, grid, block):
                 own[n] = distance
             left |= less(load(own, 0), reaches)
         if left != 0:
-            undecided[count, 0], undecided[count, 1], undecided[count, 2] = _CLOUD, k, left
+            undecided[count, 0], undecided[count, 1], undecided[count, 2] = CLOUD, k, left
             count += 1
     return count
 
@@ -252,7 +313,7 @@ def _are_apart(
     chain, bodies, pairs, vertices, cells = arm
     rows = world[0]
     frames, centres, pose, s, other = single
-    _, _, _, undecided, axes, q = block
+    _, _, _, undecided, axes, q, _, _, _ = block
     n, shapes = start.shape[0], rows.shape[0]
     lanes = 0
     for i in range(count):
@@ -268,18 +329,13 @@ def _are_apart(
         share = number / pieces
         for j in range(n):
             q[j] = start[j] + (end[j] - start[j]) * share
-        margin = rule[0]
-        for i in range(endpoint_margins.shape[0]):
-            squared = 0.0
-            for j in range(n):
-                squared += (q[j] - endpoint_margins[i, j]) ** 2
-            margin = min(margin, endpoint_margins[i, n] + rule[2] * math.sqrt(squared))
+        margin = margin_of(q, rule, endpoint_margins)
         place_arm(q, chain, bodies, frames, centres)
         for i in range(count):
             if (undecided[i, 2] >> here) & 1 == 0:
                 continue
             k, j = undecided[i, 0], undecided[i, 1]
-            if k == _PAIR:
+            if k == PAIR:
                 a, b = pairs[j, 0], pairs[j, 1]
                 gap = margin + (bodies[a, ROUNDING] + bodies[b, ROUNDING])
                 write_body_row(bodies, b, frames, centres, other)
@@ -287,7 +343,7 @@ def _are_apart(
                 apart = was_apart(
                     bodies, vertices, cells, a, other, 0, frames, centres, pose, s, gap, axes, axis
                 )
-            elif k == _CLOUD:
+            elif k == CLOUD:
                 gap = margin + rule[1] + world[3][0, 16] + bodies[j, ROUNDING]
                 apart = is_apart_from_points(
                     bodies, vertices, cells, j, world, frames, centres, pose, s, gap
@@ -311,7 +367,7 @@ def motion_batch(
     begins = np.ones(starts.shape[0], np.bool_)
     if not ends_known:
         free_batch(starts, rule, endpoint_margins, arm, world, begins)
-    memory = block_memory(arm, world)
+    memory = block_memory(arm, arm32, world)
     axes = memory[0][4]
     for i in range(starts.shape[0]):
         if not begins[i]:
@@ -335,5 +391,5 @@ def single_motion(
     """`check_motion` for Python, which takes longer to pass nested tuples than their arrays."""
     arm, world = (chain, bodies, pairs, vertices, cells), (rows, points, groups, ball)
     q, stop = np.array(start), np.array(end)
-    memory = block_memory(arm, world)
+    memory = block_memory(arm, arm32, world)
     return check_motion(q, stop, False, rule, ends, arm, arm32, world, grid, memory)

@@ -22,19 +22,25 @@ from roboarm_nmp.utils.numba_cache import compiled, uncounted
 
 
 @uncounted
+def margin_of(q, rule, endpoint_margins):
+    """The margin (m) at a state, as `CollisionChecker.is_free` has it."""
+    margin, joints = rule[0], endpoint_margins.shape[1] - 1
+    for i in range(endpoint_margins.shape[0]):
+        squared = 0.0
+        for j in range(joints):
+            squared += (q[j] - endpoint_margins[i, j]) ** 2
+        margin = min(margin, endpoint_margins[i, joints] + rule[2] * math.sqrt(squared))
+    return margin
+
+
+@uncounted
 def is_free(q, rule, endpoint_margins, arm, world, memory):
     """`CollisionChecker.is_free` of one state."""
     chain, bodies, pairs, vertices, cells = arm
     rows, _, groups, ball = world
     frames, centres, pose, s, other = memory
-    joints = endpoint_margins.shape[1] - 1
     touching = rows.shape[1] > ROW
-    margin, clearance, growth = rule[0], rule[1], rule[2]
-    for i in range(endpoint_margins.shape[0]):
-        squared = 0.0
-        for j in range(joints):
-            squared += (q[j] - endpoint_margins[i, j]) ** 2
-        margin = min(margin, endpoint_margins[i, joints] + growth * math.sqrt(squared))
+    margin, clearance = margin_of(q, rule, endpoint_margins), rule[1]
     place_arm(q, chain, bodies, frames, centres)
     for k in range(bodies.shape[0] - 1, -1, -1):  # the hand first: it moves most
         if bodies[k, LINK_ROW] < 0.0:  # the base stands where it stands

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.continuous_kernels import continuous_memory
+from roboarm_nmp.envs.collision.continuous_kernels import continuous_memory, is_motion_clear
 from roboarm_nmp.envs.collision.edge_kernels import block_memory, check_motion
 from roboarm_nmp.envs.collision.lanes_kernels import (
     WIDTH,
@@ -76,9 +76,15 @@ def _towards(start, end, reach, distance, new):
 
 
 @compiled
-def _search(start, goals, bounds, reach, checks, max_checks, random, problem, trees, memory):
-    """One try: the path (k, n), (0, n) if there is none, and the number of checks so far."""
+def _search(
+    start, goals, bounds, reach, checks, max_checks, certain, random, problem, trees, memories
+):
+    """One try: the path (k, n), (0, n) if there is none, and the number of checks so far.
+
+    `certain`: nothing touches between the states of its motions either.
+    """
     (begins, numbers, endpoints), arm, arm32, world, grid = problem
+    memory, continuous, clear_rule = memories
     nodes, columns, parents = trees
     n, m, capacity = start.shape[0], goals.shape[0], nodes.shape[1]
     size = np.array([1, m])
@@ -108,6 +114,23 @@ def _search(start, goals, bounds, reach, checks, max_checks, random, problem, tr
             nodes[tree, near], new, False, rule, margins, arm, arm32, world, grid, memory
         )
         checks += abs(more)
+        if (
+            more > 0
+            and certain
+            and not is_motion_clear(
+                nodes[tree, near],
+                new,
+                clear_rule,
+                margins,
+                arm,
+                arm32,
+                world,
+                grid,
+                memory,
+                continuous,
+            )
+        ):
+            more = -more
         other = 1 - tree
         if more > 0:
             a = size[tree]
@@ -122,7 +145,10 @@ def _search(start, goals, bounds, reach, checks, max_checks, random, problem, tr
                     nodes[other, b], new, False, rule, margins, arm, arm32, world, grid, memory
                 )
                 checks += abs(more)
-                if more <= 0:
+                if more <= 0 or certain and not is_motion_clear(
+                    nodes[other, b], new, clear_rule, margins, arm, arm32, world, grid, memory,
+                    continuous,
+                ):  # fmt: skip
                     arrived = False
                     break
                 _add(nodes, columns, parents, other, size[other], new, b)
@@ -164,10 +190,11 @@ def _joined_path(nodes, parents, a, b):
 
 
 @compiled
-def plan_path(start, goals, seed, bounds, reach, chords, checks, max_checks, problem):
+def plan_path(found, start, goals, seed, bounds, reach, chords, checks, max_checks, problem):
     """A path from `start` (n,) to one of `goals` (m, n), shortened. Nothing touches on it.
 
     Args:
+        found: (k, n), the path of another planner, which is only shortened; (0, n): none.
         seed: uint64.
         bounds: (2, n), between which random states are.
         reach: L2, the longest edge of a tree.
@@ -178,21 +205,24 @@ def plan_path(start, goals, seed, bounds, reach, chords, checks, max_checks, pro
 
     Returns: the path (k, n), (0, n) if there is none; the number of checks.
     """
-    (_, numbers, _), arm, _, world, _ = problem
+    (_, numbers, _), arm, arm32, world, _ = problem
     n = start.shape[0]
-    memory = block_memory(arm, world)
+    memory = block_memory(arm, arm32, world)
+    random = np.array([seed], np.uint64)
+    memories = memory, continuous_memory(arm, world), np.array([CLEAR, 0.0, numbers[0, 2], 0.0])
+    if found.shape[0] > 0:
+        path, more = finished(found, chords, random, problem, memories)
+        return path, checks + more
     trees = (
         np.empty((2, _CAPACITY, n)),
         np.empty(2 * n * _CAPACITY, np.float32),
         np.empty((2, _CAPACITY), np.int64),
     )
-    random = np.array([seed], np.uint64)
-    memories = memory, continuous_memory(arm, world), np.array([CLEAR, 0.0, numbers[0, 2], 0.0])
-    tries, budget = 0, _FIRST_TRY
+    tries, budget, certain = 0, _FIRST_TRY, False
     while checks < max_checks:
         limit = min(checks + budget, max_checks)
         path, checks = _search(
-            start, goals, bounds, reach, checks, limit, random, problem, trees, memory
+            start, goals, bounds, reach, checks, limit, certain, random, problem, trees, memories
         )
         tries += 1
         if tries % 2 == 0:
@@ -203,6 +233,8 @@ def plan_path(start, goals, seed, bounds, reach, chords, checks, max_checks, pro
         checks += more
         if path.shape[0] > 0:
             return path, checks
+        # It touches something between its states: the next ones may do so at the same place.
+        certain = True
     return np.empty((0, n)), checks
 
 
@@ -220,20 +252,11 @@ def finished(path, chords, random, problem, memories):
         short, checks = shortened(
             path, chords, random, False, rule, margins, arm, arm32, world, grid, memories
         )
-    if is_path_clear(short, margins, arm, world, memories):
+    if is_path_clear(short, margins, arm, arm32, world, grid, memories):
         return short, checks
-    if not is_path_clear(path, margins, arm, world, memories):
+    if not is_path_clear(path, margins, arm, arm32, world, grid, memories):
         return np.empty((0, path.shape[1])), checks
     short, more = shortened(
         path, chords, random, True, rule, margins, arm, arm32, world, grid, memories
     )
     return short, checks + more
-
-
-@compiled
-def finish_path(path, seed, chords, problem):
-    """`finished` of a path of another planner."""
-    _, arm, _, world, _ = problem
-    rule = np.array([CLEAR, 0.0, problem[0][1][0, 2], 0.0])
-    memories = block_memory(arm, world), continuous_memory(arm, world), rule
-    return finished(path, chords, np.array([seed], np.uint64), problem, memories)

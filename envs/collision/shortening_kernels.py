@@ -35,16 +35,20 @@ def _is_free(start, end, certain, rule, margins, arm, arm32, world, grid, memori
     checks = check_motion(start, end, False, rule, margins, arm, arm32, world, grid, memory)
     if checks <= 0 or not certain:
         return checks
-    is_clear = is_motion_clear(start, end, clear_rule, margins, arm, world, continuous)
+    is_clear = is_motion_clear(
+        start, end, clear_rule, margins, arm, arm32, world, grid, memory, continuous
+    )
     return checks if is_clear else -checks
 
 
 @compiled
-def is_path_clear(path, margins, arm, world, memories):
+def is_path_clear(path, margins, arm, arm32, world, grid, memories):
     """Whether nothing touches anywhere on a path (k, n)."""
-    _, continuous, clear_rule = memories
+    memory, continuous, clear_rule = memories
     for i in range(path.shape[0] - 1):
-        if not is_motion_clear(path[i], path[i + 1], clear_rule, margins, arm, world, continuous):
+        if not is_motion_clear(
+            path[i], path[i + 1], clear_rule, margins, arm, arm32, world, grid, memory, continuous
+        ):
             return False
     return True
 

@@ -64,7 +64,7 @@ MARGIN_GROWTH = 0.03
 # (Chosen on 1,000 fresh queries of `random_boxes_hard`: docs/benchmark/performance.md.)
 MARGIN_SCHEDULE = ((0, 1.0), (16_000, 0.5), (32_000, 0.25), (64_000, 0.0))
 _RULES_BEGIN = np.array([checks for checks, _ in MARGIN_SCHEDULE])
-_MARGIN_SCALES = np.array([scale for _, scale in MARGIN_SCHEDULE])
+_MARGIN_SCALES = np.array([[scale] for _, scale in MARGIN_SCHEDULE])
 # After so many checks without a path, RRT-Connect hands over to another planner for half as many.
 # They alternate, each turn twice as long as the last: LBKPIECE1 quickly finds some paths out of
 # shelves that RRT-Connect does not find.
@@ -153,10 +153,11 @@ class Planner:
             raise ValueError(f"simplify must be a number of rounds, got {simplify!r}")
         if max_checks is not None and not max_checks > 0:
             raise ValueError(f"max_checks must be positive or None, got {max_checks!r}")
-        bounds = env.robot.position_limits(limits)
-        self._bounds: tuple = ()  # those of the URDF are -1 and 1, without rounding
+        # Those of the URDF are -1 and 1, without rounding.
+        self._bounds = np.array([[-1.0], [1.0]]) * np.ones(env.robot.num_joints)
         if limits != "urdf":
-            self._bounds = tuple(np.clip(env.robot.normalise(bounds), -1.0, 1.0))
+            bounds = env.robot.position_limits(limits)
+            self._bounds = np.clip(env.robot.normalise(bounds), -1.0, 1.0)
         scale = scale_of(env.robot)
         self.env = env
         self.planner = planner
@@ -254,7 +255,9 @@ class Planner:
                 f"no path in {self.checks} collision checks (time_limit {time_limit} s, max_checks "
                 f"{self.max_checks})"
             )
-        return self._optimised(query, best, optimise, rng, deadline)
+        if optimise:
+            best = self._optimised(query, best, optimise, rng, deadline)
+        return best
 
     def _optimised(self, query, best, optimise, rng, deadline):
         """The shortest path of `optimise` further searches, or seconds of them, and of `best`."""
@@ -368,7 +371,7 @@ class Planner:
         ends = np.concatenate([start[None], goals])
         states = np.clip(checker.robot.normalise(ends), -1.0, 1.0).astype(np.float64)
         distances = checker.end_distances(states, self.margin + self.clearance + EXACTNESS)
-        if self._bounds or distances[0].min() < 0.0:
+        if self.limits != "urdf" or distances[0].min() < 0.0:
             problems = [self._problem(checker, ends[0], states[0], set())]
             # From a goal, obstacles may move away.
             moving = _moving_obstacles(self._scene)
@@ -391,7 +394,7 @@ class Planner:
         `ignored`: obstacles that are no reason. Neither are points of a cloud: there may be some of
         what the arm holds or touches.
         """
-        if self._bounds and not checker.robot.is_within(end, self.limits):
+        if self.limits != "urdf" and not checker.robot.is_within(end, self.limits):
             return f"is outside the {self.limits} position limits: {end}"
         near = checker.signed_distances(state, within=0.0)
         hits = set(near.geometry[near.distance < 0.0].tolist()) - {POINT} - ignored
@@ -416,13 +419,12 @@ class Planner:
         left = math.inf if self.max_checks is None else self.max_checks - self.checks
         rules = self._rules(query)
         is_valid = Validity(checker, rules, deadline, left)
-        bounds = self._bounds or (-np.ones(len(start)), np.ones(len(start)))
         ompl = path = None
         with contextlib.ExitStack() as locks:
 
             def ompl_search():
                 locks.enter_context(OMPL_LOCK)
-                return OmplSearch(is_valid, bounds, self.planner_range, start, goals, seed)
+                return OmplSearch(is_valid, self._bounds, self.planner_range, start, goals, seed)
 
             if callable(self.planner):
                 ompl = ompl_search()
@@ -437,13 +439,15 @@ class Planner:
                         break
                     if name == COMPILED:
                         limit = min(checks, left)
-                        path = self._compiled(query, rules, seed, bounds, is_valid, limit)
+                        path = self._compiled(query, rules, seed, is_valid, limit)
                     else:
                         ompl = ompl or ompl_search()
                         path = ompl.solve(name, checks)
                         if path is not None and self.planner == COMPILED:
                             chords = CHORDS * self.simplify
-                            path, more = checker.finish_path(path, rules, seed, chords)
+                            path, more = checker.search(
+                                start, goals, rules, seed, chords=chords, found=path
+                            )
                             is_valid.count(more)
                     if path is not None:
                         break
@@ -453,13 +457,15 @@ class Planner:
         self.checks += is_valid.checks
         if path is None:
             return None
-        reached = np.linalg.norm(goals - path[-1], axis=1).argmin()
+        reached = 0
+        if len(goals) > 1:
+            reached = np.linalg.norm(goals - path[-1], axis=1).argmin()
         path = checker.robot.denormalise(path).astype(np.float32)
         path[0] = query.ends[0]
         path[-1] = query.ends[1 + reached]
         return path
 
-    def _compiled(self, query, rules, seed, bounds, is_valid, limit):
+    def _compiled(self, query, rules, seed, is_valid, limit):
         """The path of a turn of the compiled planner, shortened, (k, n); None: it found none."""
         path, checks = query.checker.search(
             query.states[0],
@@ -467,7 +473,7 @@ class Planner:
             rules,
             # Another turn has other random numbers.
             seed=seed + (is_valid.checks << 32),
-            bounds=np.array(bounds),
+            bounds=self._bounds,
             reach=self.planner_range or REACH,
             checks=is_valid.checks,
             max_checks=limit,
@@ -480,10 +486,8 @@ class Planner:
         """`Rules` with margins that shrink, and are smaller around the ends."""
         near, from_scene = query.distances
         clearance = self.clearance if from_scene.min() >= self.clearance else 0.0
-        numbers = np.empty((len(MARGIN_SCHEDULE), 4))
-        numbers[:, 0] = self.margin * _MARGIN_SCALES
-        numbers[:, 1] = clearance * _MARGIN_SCALES
-        numbers[:, 2:] = MARGIN_GROWTH, RESOLUTION
+        numbers = _MARGIN_SCALES * (self.margin, clearance, 0.0, 0.0)
+        numbers += (0.0, 0.0, MARGIN_GROWTH, RESOLUTION)
         endpoints = np.empty((len(numbers), len(query.states), query.states.shape[1] + 1))
         endpoints[:, :, :-1] = query.states
         # Less a hair, because the ends are checked again after normalising, which rounds.
