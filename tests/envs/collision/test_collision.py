@@ -392,12 +392,16 @@ def test_continuous_check_finds_what_lies_between_states(wall):
     assert not checker.is_motion_free(LEFT, RIGHT, continuous=True)
     assert checker.is_motion_free(LEFT, [LEFT, LEFT + 0.01], continuous=True).all()
     rng = np.random.default_rng(0)
-    starts = rng.uniform(-1.0, 1.0, (400, 7))
-    starts = starts[wall.is_free(starts)]
-    ends = (starts + rng.normal(0.0, 0.1, starts.shape)).clip(-1.0, 1.0)
-    clear = wall.is_motion_free(starts, ends, continuous=True)
-    fine = wall.is_motion_free(starts, ends, resolution=0.001)
-    assert 0.2 < clear.mean() < 0.95 and not (clear & ~fine).any() and (fine & ~clear).sum() <= 1
+    points = rng.uniform((-0.6, -0.6, 0.1), (0.7, 0.6, 0.9), (20, 3))
+    for checker in (wall, CollisionChecker.from_points(points, 0.01)):
+        starts = rng.uniform(-1.0, 1.0, (400, 7))
+        starts = starts[checker.is_free(starts)]
+        ends = (starts + rng.normal(0.0, 0.1, starts.shape)).clip(-1.0, 1.0)
+        for margin in (0.0, 0.02):
+            clear = checker.is_motion_free(starts, ends, margin, continuous=True)
+            fine = checker.is_motion_free(starts, ends, margin, resolution=0.001)
+            assert 0.01 < clear.mean() < 0.95
+            assert not (clear & ~fine).any() and (fine & ~clear).sum() <= 2
 
 
 def test_spheres_cover_hulls_and_lie_in_them():
