@@ -361,7 +361,7 @@ class PolicyArm(Arm):
             self.ended = True
             return
         if act is None or plan_found is False:
-            self.problem = "no plan found"
+            self.problem = "no plan found" if act is None else "no path is verified"
         if act is not None:
             self._act = self._recorded(act)
         self.success = self._episode.ended
