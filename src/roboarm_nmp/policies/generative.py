@@ -269,8 +269,6 @@ def find_path(
                 start, goal, rng, margin, endpoint_margins=ends_near, max_checks=SEARCH_CHECKS
             )
             if found is not None:
-                found = _finished(checker, found, margin, ends_near, rng)
-            if found is not None:
                 return found, True, True
     knots = knots[np.argsort(paths.lacking(drawn), kind="stable")[:DRAWS]]
     free = checker.is_motion_free(knots[:, :-1], knots[:, 1:], endpoint_margins=near[-1])
@@ -344,5 +342,5 @@ def _finished(checker, path, margin, near, rng):
         np.array([[margin, 0.0, growth, RESOLUTION]]),
         np.concatenate([states, room[:, None]], axis=1)[None],
     )
-    seed = int(rng.integers(2**63))
-    return checker.finish_path(path.astype(np.float64), rules, seed, CHORDS)[0]
+    path, seed = np.ascontiguousarray(path, np.float64), int(rng.integers(2**63))
+    return checker.search(path[0], path[-1:], rules, seed, chords=CHORDS, found=path)[0]
