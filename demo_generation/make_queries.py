@@ -45,6 +45,7 @@ from roboarm_nmp.datasets.journal import Journal, journal_of
 from roboarm_nmp.datasets.problems import load_problems
 from roboarm_nmp.datasets.queries import query_path, write_queries
 from roboarm_nmp.demo_generation.collect import MAX_QUERIES, demonstrate
+from roboarm_nmp.envs import world
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.moving_boxes import MovingScenes
 from roboarm_nmp.envs.scenes.primitives import Scene, from_lists, to_lists
@@ -58,7 +59,7 @@ from roboarm_nmp.utils.progress import progress_bar, write_line
 from roboarm_nmp.utils.random_streams import Stream
 from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
-# Stored queries are held longer than those sampled in training: 0.8 s.
+# Stored queries are held longer than those sampled in training, 0.8 s; not so in wide scenes.
 HOLD_STEPS = 24
 STREAMS = {"test": Stream.TEST_QUERIES, "validation": Stream.VALIDATION_QUERIES}
 SCENES = 1  # a fourth number, for the scenes of a split
@@ -168,8 +169,7 @@ class Sampler:
                 continue
             if moving:
                 self.env.set_scene(self.env.scene_at_rest)
-            held = (goal,) if start is start_of_scene else (start, goal)
-            if not all(self.env.is_feasible(end, HOLD_STEPS) for end in held):
+            if not self._are_held(start, goal):
                 rejected["unheld"] += 1
             elif self.planner and not self._is_solved(self.planner, start, goal, rng):
                 rejected["unsolved"] += 1
@@ -187,6 +187,11 @@ class Sampler:
                 return query
         raise RuntimeError(f"{MAX_QUERIES} queries in a row were rejected: {dict(rejected)}")
 
+    def _are_held(self, start, goal) -> bool:
+        # Ends in wide scenes have a margin, and were held when they were sampled.
+        is_wide = isinstance(self.env.scene_distribution, WideScenes)
+        return is_wide or all(self.env.is_feasible(end, HOLD_STEPS) for end in (start, goal))
+
     def _is_solved(self, planner: Planner, start, goal, rng: np.random.Generator) -> bool:
         if self.follows_plans:
             return demonstrate(planner, start, goal, rng, SOLVE_ATTEMPTS) is not None
@@ -201,12 +206,8 @@ class Sampler:
         if scene_seed != self._wide_scene[0]:
             rng = np.random.default_rng(scene_seeds(scene_seed)[0])
             self.env.sample_scene(rng)
-            start = None
-            while self.queries_per_scene > 1 and start is None:
-                start = self.env.sample_end(rng)
-                if not self.env.is_feasible(start, HOLD_STEPS):
-                    start = None
-            self._wide_scene = scene_seed, start
+            is_shared = self.queries_per_scene > 1
+            self._wide_scene = scene_seed, self.env.sample_end(rng) if is_shared else None
         return self._wide_scene[1]
 
     def _sample_query(
@@ -314,6 +315,7 @@ def make_queries(
             for query in results:
                 journal.append(query)
                 bar.update()
+        is_wide = isinstance(distribution, WideScenes)
         rejected = Counter()
         for split, num in (("test", num_test), ("validation", num_validation)):
             made = [journal.entries[f"{split}/{number}"] for number in range(num)]
@@ -331,7 +333,7 @@ def make_queries(
                 scenes = [replace(base, obstacles=from_lists(row)) for row in rows]
                 splits[split] = (start, goal, scenes)
         parameters = {
-            "hold_steps": HOLD_STEPS,
+            "hold_steps": world.HOLD_STEPS if is_wide else HOLD_STEPS,
             "hold_drift": HOLD_DRIFT,
             "time_step": TIME_STEP,
             "substeps": SUBSTEPS,
