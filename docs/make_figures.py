@@ -5,9 +5,11 @@
 For each task, `mixed_scenes` and `containers`: one test query (where scenes vary, six draws), the
 arm at its start and as a ghost at the goal; and where the scene is fixed, the end-effector paths of
 the first demonstrations, from light (start) to dark (goal). `task_gallery.png` shows all tasks with
-names.
+names, and `wide_families.png` a scene of each family of wide scenes, which `--wide` renders alone.
 """
 
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,15 +20,18 @@ from roboarm_nmp import envs
 from roboarm_nmp.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.datasets.queries import Query, load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.scenes.primitives import Box, Scene
+from roboarm_nmp.envs.scenes.wide_scenes.distribution import WideScenes
+from roboarm_nmp.envs.scenes.wide_scenes.names import FAMILIES, HELD_OUT
 from roboarm_nmp.utils.bullet import pybullet as p
 from roboarm_nmp.viewer.images import render_query
 
 SIZE = (480, 360)
 QUERY = 2  # its start and goal lie on two sides of the walls
 ROWS, COLUMNS = 2, 3  # of scenes that vary
-GALLERY_COLUMNS, LABEL = 5, 22  # of all tasks; height (pixels) of their names
+GALLERY_COLUMNS, LABEL = 5, 22  # of all tasks; height (pixels) of names
 NUM_DEMOS = 24
+FAMILY_SEEDS = {}  # of figures of families of wide scenes, where the first one shows little
 COLOURS = ((0.85, 0.30, 0.25), (0.20, 0.45, 0.80), (0.95, 0.65, 0.15), (0.25, 0.60, 0.35))
 FOLDER = Path(__file__).parent / "figures"
 
@@ -49,18 +54,39 @@ def draw_path(client, positions, colour):
             )
 
 
-def save_gallery(tiles):
-    """All tasks in a grid: a dict from names to images, all of one size."""
+def save_gallery(tiles, file, columns=GALLERY_COLUMNS):
+    """Images of one size in a grid, with their names: a dict from names to images."""
     height, width, _ = next(iter(tiles.values())).shape
-    rows = -(-len(tiles) // GALLERY_COLUMNS)
-    grid = Image.new("RGB", (GALLERY_COLUMNS * width, rows * (height + LABEL)), "white")
+    rows = -(-len(tiles) // columns)
+    grid = Image.new("RGB", (columns * width, rows * (height + LABEL)), "white")
     draw, font = ImageDraw.Draw(grid), ImageFont.load_default(15)
     for i, (name, tile) in enumerate(tiles.items()):
-        left = i % GALLERY_COLUMNS * width
-        top = i // GALLERY_COLUMNS * (height + LABEL)
+        left = i % columns * width
+        top = i // columns * (height + LABEL)
         grid.paste(Image.fromarray(tile), (left, top))
         draw.text((left + width // 2, top + height + 3), name, "black", font, anchor="ma")
-    save(np.asarray(grid), "task_gallery.png")
+    save(np.asarray(grid), file)
+
+
+def save_wide_families():
+    """A scene of each family, without the ground, which would hide too much."""
+    tiles = {}
+    for name in tqdm(FAMILIES, unit="family"):
+        env = envs.RoboArmEnv(WideScenes((name,)), render_mode="rgb_array", goal_type="combined")
+        rng = np.random.default_rng(FAMILY_SEEDS.get(name, 0))
+        env.sample_scene(rng)
+        query = env.sample_query(rng)
+        obstacles = [o for o in env.scene.obstacles if not is_ground(o)]
+        scene = replace(env.scene, obstacles=tuple(obstacles))
+        pixels = render_query(env, Query(*query, scene), SIZE)
+        tiles[name] = pixels[::2, ::2]
+        env.close()
+    held_out = {f"{name} (held out)": tiles.pop(name) for name in HELD_OUT}
+    save_gallery(tiles | held_out, "wide_families.png", 6)
+
+
+def is_ground(obstacle):
+    return isinstance(obstacle, Box) and min(obstacle.size[:2]) > 2.5
 
 
 def main():
@@ -94,8 +120,10 @@ def main():
             pixels = render_query(env, query, SIZE, np.concatenate(everywhere))
             save(pixels, f"{task}_demos.png")
         env.close()
-    save_gallery(dict(sorted(gallery.items(), key=lambda item: item[0].startswith("random"))))
+    gallery = dict(sorted(gallery.items(), key=lambda item: item[0].startswith("random")))
+    save_gallery(gallery, "task_gallery.png")
+    save_wide_families()
 
 
 if __name__ == "__main__":
-    main()
+    save_wide_families() if "--wide" in sys.argv else main()
