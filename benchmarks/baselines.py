@@ -32,6 +32,8 @@ ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks/results/baselines.json"
 UNSEEN = ROOT / "benchmarks/results/unseen_obstacles.json"  # another benchmark's
 PAPER = ROOT / "benchmarks/results/paper_go_to_goal.csv"
+# Wide scenes have a page of their own.
+TABULATED = {name: task for name, task in STATIC_TASKS.items() if not name.startswith("wide")}
 CELLS = {
     "go-to-goal": ["--policy", "go-to-goal"],
     "via-points, K = 16": ["--policy", "via-points", "--tries", "16"],
@@ -87,13 +89,13 @@ def papers_go_to_goal():
 
 def tables(results, unseen):
     """Name -> Markdown. `unseen`: results of benchmarks/unseen_obstacles.py."""
-    results = {task: dict(results.get(task, {})) for task in STATIC_TASKS}
+    results = {task: dict(results.get(task, {})) for task in TABULATED}
     for task, found in unseen.items():
         if REACTIVE in found:
             results[task][REACTIVE] = found[REACTIVE]
     papers = {task: share(value) for task, value in papers_go_to_goal().items()}
     success = matrix(results, "success_rate", share)
-    for row, task in zip(success, STATIC_TASKS, strict=True):
+    for row, task in zip(success, TABULATED, strict=True):
         row.insert(1, papers.get(task, NOTHING))
     names = [SHOWN.get(name, name) for name in COLUMNS]
     head = ["task", *names]
@@ -113,7 +115,7 @@ def tables(results, unseen):
 def matrix(results, key, form, names=None):
     """Rows: a task each, and one quantity of each policy."""
     rows = []
-    for task in STATIC_TASKS:
+    for task in TABULATED:
         values = [results[task].get(name, {}).get(key) for name in names or COLUMNS]
         shown = [NOTHING if value is None else form(value) for value in values]
         rows.append([f"`{task}`", *shown])
@@ -139,7 +141,7 @@ def policies(results):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--only", nargs="+", choices=list(STATIC_TASKS), metavar="TASK")
+    parser.add_argument("--only", nargs="+", choices=list(TABULATED), metavar="TASK")
     parser.add_argument("--policies", nargs="+", default=list(CELLS), choices=list(CELLS))
     parser.add_argument("--num", type=int, default=1000, help="queries for those that search")
     parser.add_argument("--workers", type=int, default=1)
@@ -148,7 +150,7 @@ def main():
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     if not args.table:
         # A task without a pretrained query file has no cells.
-        tasks = args.only or [task for task in STATIC_TASKS if query_path(task).exists()]
+        tasks = args.only or [task for task in TABULATED if query_path(task).exists()]
         run(results, tasks, args.policies, args.num, args.workers)
     unseen = json.loads(UNSEEN.read_text()) if UNSEEN.exists() else {}
     write(tables(results, unseen))

@@ -24,11 +24,11 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from baselines import TABULATED
 from markdown_tables import NOTHING, interval, share, table, write, write_cells
 
 from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.perception.encoders import PRETRAINED
-from roboarm_nmp.envs.tasks import STATIC_TASKS
 from roboarm_nmp.networks.export import to_float16
 from roboarm_nmp.policies.registry import PolicyError, find_policy
 from roboarm_nmp.policies.safety_filter import VERSION
@@ -149,7 +149,7 @@ SHOWN = {
     f"{FLOW}, search": "flow, search",
 }
 UNSEEN = [
-    name for name, task in STATIC_TASKS.items() if name.startswith("random") or not task.trainable
+    name for name, task in TABULATED.items() if name.startswith("random") or not task.trainable
 ]
 # Results of benchmarks/results/baselines.json, which do not depend on the goal type: `combined` is
 # reached like `ee`.
@@ -317,7 +317,7 @@ def others_results(baselines):
 
 def tables(results, others):
     """Name -> Markdown. `others` are the results of `others_results`."""
-    results = {task: others.get(task, {}) | results.get(task, {}) for task in STATIC_TASKS}
+    results = {task: others.get(task, {}) | results.get(task, {}) for task in TABULATED}
     hard = results[HARD]
     found = {
         "unseen-policies": policies_table(hard),
@@ -325,7 +325,7 @@ def tables(results, others):
         "unseen-seeds": seeds_table(hard),
     }
     for name, columns, tasks in (
-        ("unseen-tasks", ("go-to-goal", *EVERYWHERE), list(STATIC_TASKS)),
+        ("unseen-tasks", ("go-to-goal", *EVERYWHERE), list(TABULATED)),
         ("unseen-encoders", WITH_ENCODERS, UNSEEN),
     ):
         found[f"{name}-success"] = matrix(results, "success_rate", columns, tasks, papers_best())
@@ -415,7 +415,7 @@ def _mark(result):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--only", nargs="+", choices=list(STATIC_TASKS), metavar="TASK")
+    parser.add_argument("--only", nargs="+", choices=list(TABULATED), metavar="TASK")
     parser.add_argument("--cells", nargs="+", choices=list(CELLS), metavar="CELL")
     parser.add_argument("--num", type=int, default=1000, help="queries of a cell")
     parser.add_argument("--workers", type=int, default=1)
@@ -427,7 +427,7 @@ def main():
     if not args.table:
         if args.only is None or HARD in args.only:
             run([HARD], args.cells or CELLS, args.num, args.workers)
-        others = [task for task in args.only or STATIC_TASKS if task != HARD]
+        others = [task for task in args.only or TABULATED if task != HARD]
         run(others, args.cells or EVERYWHERE, args.num, args.workers)
         if args.cells is None:
             unseen = [task for task in others if task in UNSEEN]

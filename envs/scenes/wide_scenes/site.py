@@ -168,8 +168,8 @@ class Site:
         """A region for the end effector, a box of a size, and how the hand enters it."""
         towards = np.asarray(approach, float) / np.linalg.norm(approach)
         fingers = None if across is None else np.asarray(across, float) / np.linalg.norm(across)
-        size = np.maximum(size, 0.004)
-        self.places.append(Place(np.array(centre, float), size, np.eye(3), towards, fingers))
+        sizes = np.maximum(np.asarray(size, float), 0.004)
+        self.places.append(Place(np.array(centre, float), sizes, np.eye(3), towards, fingers))
 
     def grasp_from_above(self, foot: Point, width: float, height: float, yaw: float) -> None:
         """Fingers around the top of a thing, which is `width` wide along the yaw."""
@@ -252,7 +252,8 @@ class Site:
             elif part.kind is Box:
                 obstacles.append(Box(centre, _floats(lengths), quaternion))
             elif part.kind is Cylinder:
-                obstacles.append(Cylinder(centre, *_floats(lengths), quaternion))
+                radius, length = _floats(lengths)
+                obstacles.append(Cylinder(centre, radius, length, quaternion))
             else:
                 obstacles.append(
                     ConvexHull(centre, tuple(map(_floats, lengths @ flip)), quaternion)

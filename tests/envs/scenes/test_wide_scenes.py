@@ -26,9 +26,9 @@ def test_held_out_families_are_those_drawn_first_and_no_task_mixes_them():
     assert HELD_OUT == ("bottle_rack", "conveyor", "pipes", "rubble")
     assert sorted(TRAINING + HELD_OUT) == sorted(FAMILIES) == sorted(SITES)
     assert not set(TRAINING) & set(HELD_OUT)
-    assert envs.get_task("wide_scenes").scene.families == TRAINING
+    assert envs.get_task("wide_scenes").scene == WideScenes(TRAINING)
     task = envs.get_task("wide_scenes_held_out")
-    assert task.scene.families == HELD_OUT and not task.trainable
+    assert task.scene == WideScenes(HELD_OUT) and not task.trainable
 
 
 @pytest.mark.parametrize("family", FAMILIES)
