@@ -128,7 +128,7 @@ def drawers(site: Site) -> None:
         for y in (-0.06, 0.06):
             site.rod((-out - 0.01, y, (low + high) / 2), (-out - 0.06, y, (low + high) / 2), 0.006)
         bar = [(-out - 0.06, y, (low + high) / 2) for y in (-0.07, 0.07)]
-        site.rod(*bar, 0.007)
+        site.rod(bar[0], bar[1], 0.007)
         site.place((-out - 0.06, 0, (low + high) / 2), (0.006, 0.05, 0.006), FORWARD, (0, 0, 1))
         if out:
             wall = (high - low) * site.between(0.6, 0.9)

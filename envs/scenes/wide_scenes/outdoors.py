@@ -245,7 +245,7 @@ def scaffold(site: Site) -> None:
     for _ in range(site.count(1, 2)):
         x = site.rng.choice([-0.04, deep + 0.04])
         ends = [(x, posts[0], levels[0]), (x, posts[1], levels[1])]
-        site.rod(*ends, tube)
+        site.rod(ends[0], ends[1], tube)
         if site.chance(0.3):
             site.rod((x, posts[0], levels[1]), (x, posts[1], levels[0]), tube)
     for z in levels:  # decks of planks, some missing
@@ -313,7 +313,7 @@ def stud_wall(site: Site) -> None:
     for _ in range(site.count(1, 3)):  # cables and pipes through the studs
         z, radius = site.between(0.5, 1.5), site.between(0.008, 0.025)
         ends = [(deep / 2, edges[0], z), (deep / 2, edges[-1], z)]
-        site.rod(*ends, radius)
+        site.rod(ends[0], ends[1], radius)
         a = edges[site.count(0, bays - 1)]
         site.place((deep / 2, a + step / 2, z), (0.008, step / 2, 0.008), FORWARD, (0, 0, 1))
     if site.chance(0.6):  # a ladder
