@@ -31,6 +31,7 @@ COMMANDS = {
     "show": ("viewer.show", "image or animation of a task and of a policy"),
     "view": ("viewer.app", "policies in the browser; move goal and obstacles"),
     "demo": ("viewer.demo", "a pretrained policy in the browser, without arguments"),
+    "compile": ("viewer.compile", "compile collision checks and plans, once per machine"),
     "retime": ("motions.retime", "make an executable trajectory of a joint path"),
     "sweep": ("clean_rl_scripts.sweep", "search a trainer's flags with Optuna"),
     "plan": ("demo_generation.plan", "plan a motion among points or in a scene"),

@@ -8,6 +8,9 @@ import sys
 import pytest
 from paths import LIBRARY, ROOT
 
+from roboarm_nmp.utils.numba_cache import compiled
+from roboarm_nmp.viewer import compile as compile_command
+
 MODULE = """
 from roboarm_nmp.utils.numba_cache import compiled
 
@@ -112,7 +115,9 @@ def test_cache_is_in_the_user_folder_and_the_first_compilation_is_announced_once
     outputs = [process.communicate() for process in at_once]
     assert [process.returncode for process in at_once] == [0, 0], outputs
     lines = "".join(error for _, error in outputs).splitlines()
-    assert lines == ["compiling collision checks and kinematics (once, one to two minutes)"]
+    assert lines == [
+        "compiling once, one to two minutes (roboarm compile does it for all commands)"
+    ]
     assert begin("small", folder, **variables).communicate() == ("12.0 12\n", "")
     assert list(tmp_path.glob("numba/*/small.quadruple*.nbc"))
 
@@ -137,3 +142,29 @@ def test_compiled_functions_are_in_files_that_the_cache_watches():
     for path in ROOT.rglob("*.py"):
         if not path.is_relative_to(ROOT / "tests") and "import compiled" in path.read_text():
             assert path.name.endswith("kernels.py"), path
+
+
+@compiled
+def _sum(a, b):
+    return a + b
+
+
+@compiled
+def _sums(a):
+    return _sum(a, 0) + _sum(3, a) + _sum(a, a)
+
+
+def test_numbers_in_calls_need_no_compilation_of_their_own():
+    assert _sums(2) == 11 and len(_sum.signatures) == 1
+
+
+def test_compile_has_something_to_do_once(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("ROBOARM_NMP_CACHE", str(tmp_path))
+    calls = []
+    monkeypatch.setattr(compile_command, "PARTS", {"plan": lambda: calls.append("plan")})
+    compile_command.main(compile_command.Args())
+    assert "compiled in" in capsys.readouterr().out
+    compile_command.main(compile_command.Args())
+    assert "compiled before" in capsys.readouterr().out and calls == ["plan"]
+    compile_command.main(compile_command.Args(force=True))
+    assert calls == ["plan", "plan"]

@@ -18,11 +18,14 @@ import functools
 import hashlib
 import os
 import pickle
+import platform
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numba
-from numba.core import config
+from llvmlite.binding import get_host_cpu_name
+from numba.core import config, types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.serialize import dumps
 
@@ -43,6 +46,12 @@ def uncounted(function):
 def compiled(function, **options):
     """Numba's `njit`, cached on disk where a folder for that can be written to."""
     dispatcher = numba.njit(nogil=True, error_model="numpy", **options)(function)
+    resolve = dispatcher.get_call_template
+    # A call with a number in the code, f(a, 0), is one with any integer: no compilation of its own.
+    dispatcher.get_call_template = lambda args, kws: resolve(
+        tuple(types.unliteral(kind) for kind in args),
+        {name: types.unliteral(kind) for name, kind in kws.items()},
+    )
     folder = config.CACHE_DIR
     # (RuntimeError: no folder can be written to. OSError: there is no home folder.)
     with contextlib.suppress(RuntimeError, OSError):
@@ -64,7 +73,46 @@ def _announce_compilation(folder):
     with contextlib.suppress(OSError):
         _lock = open(Path(folder, "compiling"), "wb")  # noqa: SIM115
         fcntl.flock(_lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        write_line("compiling collision checks and kinematics (once, one to two minutes)")
+        if _on_compilation is None:
+            write_line(
+                "compiling once, one to two minutes (roboarm compile does it for all commands)"
+            )
+
+
+_on_compilation: Callable[[], None] | None = None
+
+
+@contextlib.contextmanager
+def watch_compilations(function: Callable[[], None]) -> Iterator[None]:
+    """A context in which a function is called before each compilation, instead of the line."""
+    global _on_compilation
+    _on_compilation = function
+    try:
+        yield
+    finally:
+        _on_compilation = None
+
+
+def _stamp() -> Path:
+    """A file in the cache that is there once all was compiled for this machine. Raises OSError."""
+    parts = _kernels_digest(), numba.__version__, platform.machine(), get_host_cpu_name()
+    name = hashlib.sha256(" ".join(parts).encode()).hexdigest()[:16]
+    return Path(config.CACHE_DIR or cache_folder() / "numba", f"compiled-{name}")
+
+
+def is_compiled() -> bool:
+    """Whether `mark_compiled` was called for these functions on such a machine."""
+    try:
+        return _stamp().exists()
+    except OSError:  # there is no cache
+        return False
+
+
+def mark_compiled() -> None:
+    """Remember that all functions are in the cache."""
+    with contextlib.suppress(OSError):
+        _stamp().parent.mkdir(parents=True, exist_ok=True)
+        _stamp().touch()
 
 
 class _CheckedResult(CompileResultCacheImpl):
@@ -105,6 +153,8 @@ class _CheckedCache(FunctionCache):
             overload = super().load_overload(sig, target_context)
             if overload is None:
                 _announce_compilation(self.cache_path)
+                if _on_compilation is not None:
+                    _on_compilation()
             return overload
         except Exception:  # unpickling wrong bytes raises exceptions of many types
             path = self._damaged_path(sig, target_context)

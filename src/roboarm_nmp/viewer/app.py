@@ -921,6 +921,7 @@ def _view(args):
 
 def _make_page(server, simulation, args, folder) -> _Page:
     """The page of a simulation, whose policies are being made."""
+    from roboarm_nmp.viewer.compile import compile_in_process
     from roboarm_nmp.viewer.simulation import WaitingArm
 
     task = simulation.episodes.task
@@ -936,6 +937,8 @@ def _make_page(server, simulation, args, folder) -> _Page:
         def work():
             with lock:
                 try:
+                    if choice.policy not in ("go-to-goal", "random"):
+                        compile_in_process()  # which would stop the page in this process
                     arm = _arm(args, task, choice, seed)
                     arm.compile()
                 except ValueError as error:

@@ -178,7 +178,7 @@ class WaitingArm(Arm):
         problem: why it waits.
     """
 
-    LOADING = "loading (for the first time on a machine, about half a minute longer)"
+    LOADING = "loading; the first time on a machine, functions are compiled, which takes a minute"
 
     def __init__(self, name: str, problem: str = LOADING):
         super().__init__(name)
