@@ -115,9 +115,7 @@ def test_cache_is_in_the_user_folder_and_the_first_compilation_is_announced_once
     outputs = [process.communicate() for process in at_once]
     assert [process.returncode for process in at_once] == [0, 0], outputs
     lines = "".join(error for _, error in outputs).splitlines()
-    assert lines == [
-        "compiling once, one to two minutes (roboarm compile does it for all commands)"
-    ]
+    assert lines == ["compiling once, one to two minutes (roboarm compile: for all commands)"]
     assert begin("small", folder, **variables).communicate() == ("12.0 12\n", "")
     assert list(tmp_path.glob("numba/*/small.quadruple*.nbc"))
 

@@ -106,6 +106,6 @@ def main(args: Args) -> None:
 if __name__ == "__main__":
     end_with_one_line("the same command starts again")
     try:
-        main(flags.parse(Args))
+        main(flags.parse(Args, others="compilation"))
     except (OSError, RuntimeError, ValueError) as error:
         sys.exit(error_line(error))
