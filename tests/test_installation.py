@@ -70,6 +70,9 @@ def test_every_later_python_is_accepted():
     accepted = SpecifierSet(re.search(r'^requires-python = "(.*)"', project, re.MULTILINE)[1])
     assert all(version in accepted for version in (*PYTHONS, "3.15", "4.0"))
     assert "3.9" not in accepted
+    old = "import runpy, sys; sys.version_info = (3, 9, 18); runpy.run_path('setup.py')"
+    done = subprocess.run([sys.executable, "-c", old], cwd=ROOT, capture_output=True, text=True)
+    assert done.stderr.startswith("RoboArm-NMP needs Python 3.10 or later, and this is 3.9")
     assert set(re.findall(r"Python :: (3\.\d+)", project)) == set(PYTHONS)
 
 

@@ -1,4 +1,4 @@
-"""Objects attached to an arm's links, as XML of its URDF: links of their own on fixed joints."""
+"""Objects attached to an arm's links, as XML of its URDF, and meshes as OBJ files for PyBullet."""
 
 import atexit
 import functools
@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from roboarm_nmp.envs.robots.glb import read_glb
 from roboarm_nmp.envs.robots.rotations import matrix
 
 COLOUR = "0.85 0.55 0.2 1"
@@ -59,7 +60,7 @@ def _add_shape(element, attached):
     geometry = ElementTree.SubElement(element, "geometry")
     if hasattr(shape, "vertices"):
         ElementTree.SubElement(
-            geometry, "mesh", filename=_obj_file(shape.vertices, attached.triangles)
+            geometry, "mesh", filename=_obj_file([(shape.vertices, attached.triangles)])
         )
     elif hasattr(shape, "size"):
         ElementTree.SubElement(geometry, "box", size=_text(shape.size))
@@ -84,10 +85,24 @@ def _roll_pitch_yaw(quaternion):
     return math.atan2(m[2, 1], m[2, 2]), pitch, math.atan2(m[1, 0], m[0, 0])
 
 
-def _obj_file(vertices, triangles):
-    """The path of an OBJ file, which lasts as long as this process."""
-    lines = [f"v {_text(vertex)}" for vertex in vertices]
-    lines += [f"f {' '.join(str(corner + 1) for corner in corners)}" for corners in triangles]
+def obj_of_glb(path: str) -> str:
+    """The path of an OBJ file with the meshes of a GLB file, as long as this process lasts."""
+    return _obj_of_glb(path, os.stat(path).st_mtime_ns, os.getpid())
+
+
+@functools.lru_cache(100)
+def _obj_of_glb(path, changed, process):
+    return _obj_file(read_glb(Path(path).read_bytes()))
+
+
+def _obj_file(meshes):
+    """The path of an OBJ file of meshes, which lasts as long as this process."""
+    lines, before = [], 1  # OBJ counts vertices from 1, over all of its objects
+    for vertices, triangles in meshes:
+        lines.append("o mesh")
+        lines += [f"v {_text(vertex)}" for vertex in vertices]
+        lines += [f"f {' '.join(str(before + i) for i in corners)}" for corners in triangles]
+        before += len(vertices)
     text = "\n".join(lines) + "\n"
     path = _folder(os.getpid()) / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.obj"
     if not path.exists():

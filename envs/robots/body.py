@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from roboarm_nmp.envs.robots.attached_xml import attached_elements
+from roboarm_nmp.envs.robots.attached_xml import attached_elements, obj_of_glb
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.robots.rotations import matrix, signed
 from roboarm_nmp.utils.bullet import load_urdf
@@ -238,8 +238,20 @@ def _readable_urdf(robot):
     text = robot.xml
     if robot.attached:
         text = ElementTree.tostring(parsed_urdf(robot), "unicode")
-    with temporary_file(text, ".urdf") as urdf:
+    with temporary_file(bullets_xml(text), ".urdf") as urdf:
         yield urdf
+
+
+def bullets_xml(text: str) -> str:
+    """The text of a URDF with absolute paths, with OBJ files in the place of GLB files."""
+    if ".glb" not in text.lower():
+        return text
+    root = ElementTree.fromstring(text)
+    for mesh in root.iter("mesh"):
+        path = mesh.get("filename", "")
+        if path.lower().endswith(".glb"):
+            mesh.set("filename", obj_of_glb(path))
+    return ElementTree.tostring(root, "unicode")
 
 
 def resolve(

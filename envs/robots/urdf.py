@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from roboarm_nmp.envs.robots.body import end_effector_rotation
+from roboarm_nmp.envs.robots.body import bullets_xml, end_effector_rotation
 from roboarm_nmp.envs.robots.cache import cached
 from roboarm_nmp.envs.robots.control import GAINS, calibrate
 from roboarm_nmp.envs.robots.placements import (
@@ -188,7 +188,7 @@ def robot_from_urdf(
             ElementTree.SubElement(joint, "limit")  # PyBullet loads no joint without
     ElementTree.indent(tree.root)  # PyBullet breaks lines of more than 8,191 letters
     xml = ElementTree.tostring(tree.root, "unicode")
-    joint_index, link_index, shapes = bullet_indices(path, xml)
+    joint_index, link_index, shapes = bullet_indices(path, bullets_xml(xml))
     for link, element in tree.elements.items():
         if shapes[link] < len(element.findall("collision")):
             raise tree.error(f"link {link!r}: PyBullet cannot use one of its collision shapes")

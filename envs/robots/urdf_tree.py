@@ -13,6 +13,7 @@ import numpy as np
 
 from roboarm_nmp.envs.robots.attached_xml import LIGHT, add_inertial
 from roboarm_nmp.envs.robots.body import resolve
+from roboarm_nmp.envs.robots.glb import read_glb
 from roboarm_nmp.envs.robots.placements import joint_axis, joint_end
 from roboarm_nmp.envs.robots.untrusted import RobotError, read_xml
 
@@ -23,7 +24,7 @@ MAX_MESHES = {"collision": 50_000_000, "visual": 100_000_000}
 MAX_SHAPES = 500
 MAX_MESH = {"collision": 20_000_000, "visual": 30_000_000}  # bytes of one
 BLOCK = 4_000_000  # bytes of a mesh that are read at once
-MESH_ENDINGS = (".obj", ".stl", ".dae")
+MESH_ENDINGS = (".obj", ".stl", ".dae", ".glb")
 MOVABLE = ("revolute", "continuous", "prismatic")
 DEFAULT_EFFORT = 1_000.0  # N m or N, where a URDF has none
 MAX_NUMBER = 1e6
@@ -186,6 +187,7 @@ class UrdfTree:
                         raise self.error(
                             f"link {name!r}: a face of mesh {file} has a vertex that is not there"
                         )
+                    parts = self._glb_parts(name, file, contents)
                     if kind == "visual":
                         continue
                     if file.suffix.lower() == ".stl" and _is_text(contents):
@@ -193,7 +195,7 @@ class UrdfTree:
                             f"link {name!r}: PyBullet cannot use mesh {file}, an STL file of text: "
                             f"save it as a binary one"
                         )
-                    shapes += contents.count(b"\no ") + contents.count(b"\ng ")
+                    shapes += parts or contents.count(b"\no ") + contents.count(b"\ng ")
                     digest.update(contents)
             for shape in link.findall("collision"):
                 digest.update(_beside_mesh(shape))
@@ -201,6 +203,15 @@ class UrdfTree:
         if shapes > MAX_SHAPES:
             raise self.error(f"{shapes} collision shapes, at most {MAX_SHAPES}")
         return digest.hexdigest()
+
+    def _glb_parts(self, link, file, contents):
+        """The number of meshes in a GLB file; 0 for another file."""
+        if file.suffix.lower() != ".glb":
+            return 0
+        try:
+            return len(read_glb(contents))
+        except ValueError as error:
+            raise self.error(f"link {link!r}: mesh {file}: {error}") from error
 
     def _mesh_file(self, link, mesh, folders, packages):
         """The path of a mesh that may be read: one in `folders`."""

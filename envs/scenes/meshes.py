@@ -1,4 +1,4 @@
-"""Meshes as convex hulls: STL, OBJ and PLY files, and triangles from other files.
+"""Meshes as convex hulls: STL, OBJ, PLY and GLB files, and triangles from other files.
 
 Files are read by trimesh, and split by CoACD (Wei et al., 2022): the extra `meshes`.
 
@@ -17,10 +17,11 @@ from typing import Any
 
 import numpy as np
 
+from roboarm_nmp.envs.robots.glb import read_glb
 from roboarm_nmp.envs.scenes.numbers import IDENTITY, MAX_LENGTH, Quaternion, Vector
 from roboarm_nmp.envs.scenes.primitives import ConvexHull, convex_hull
 
-MESH_FILES = (".stl", ".obj", ".ply")
+MESH_FILES = (".stl", ".obj", ".ply", ".glb")
 MAX_MESH_BYTES = 20_000_000
 MAX_TRIANGLES = 500_000
 MAX_CONCAVITY = 0.001
@@ -81,22 +82,33 @@ def load_mesh(name: str, folder: str | Path) -> tuple[np.ndarray, np.ndarray]:
         reason = getattr(error, "strerror", None) or "cannot be read"
         raise MeshError(f"{name}: {reason}") from error
     try:
+        vertices, faces = _joined(read_glb(contents)) if kind == ".glb" else _read(contents, kind)
+        check_mesh(vertices, faces)
+    except ValueError as error:
+        raise MeshError(f"{name}: {error}") from error
+    return vertices, faces
+
+
+def _read(contents, kind):
+    """The vertices and triangles of an STL, OBJ or PLY file."""
+    try:
         import trimesh
     except ImportError as error:
-        raise MeshError(f"{name}: meshes need: pip install 'roboarm-nmp[meshes]'") from error
+        raise MeshError("meshes need: pip install 'roboarm-nmp[meshes]'") from error
     try:
         mesh: Any = trimesh.load_mesh(
             io.BytesIO(contents), file_type=kind[1:], process=False, skip_materials=True
         )
-        vertices = np.array(mesh.vertices, dtype=np.float64)
-        faces = np.array(mesh.faces, dtype=np.int64)
+        return np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
     except Exception as error:  # damaged files raise all kinds of exceptions
-        raise MeshError(f"{name}: damaged, or no {kind[1:].upper()} file") from error
-    try:
-        check_mesh(vertices, faces)
-    except MeshError as error:
-        raise MeshError(f"{name}: {error}") from error
-    return vertices, faces
+        raise MeshError(f"damaged, or no {kind[1:].upper()} file") from error
+
+
+def _joined(parts):
+    """The vertices and triangles of several meshes as those of one."""
+    firsts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    faces = [corners + first for (_, corners), first in zip(parts, firsts, strict=False)]
+    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
 
 
 def check_mesh(vertices: np.ndarray, faces: np.ndarray) -> None:

@@ -1,6 +1,7 @@
 """Query files: exact, reproducible, written atomically; errors of bad files name them."""
 
 import dataclasses
+import fcntl
 import json
 import subprocess
 import sys
@@ -179,6 +180,14 @@ def elsewhere(path):
         del file["test/goal"]
         shape, where = (30, 7), [("/dev/zero", 0, h5py.h5f.UNLIMITED)]
         file.create_dataset("test/goal", shape, np.float32, external=where)
+
+
+def test_file_that_another_program_writes_is_in_use(path):
+    truncate(path)
+    with open(path, "ab") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # as HDF5 does
+        with pytest.raises(DatasetError, match=f"{path}: another program has it open for writing"):
+            load_queries(path)
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ temporary name and then renamed: there is never half a file.
 """
 
 import contextlib
+import fcntl
 import functools
 import hashlib
 import io
@@ -569,17 +570,33 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
     except OSError as error:
         raise DatasetError(f"{path}: {error.strerror}") from error
     if not h5py.is_hdf5(path):
+        _check_not_in_use(path)
         raise DatasetError(f"{path}: not an HDF5 file")
     try:
         # Our files are replaced as a whole, so they need no locks, which not every file system has.
         with h5py.File(path, "r", locking=False) as file:
             yield file
-    except DatasetError:
-        raise
     except Exception as error:
+        _check_not_in_use(path)
+        if isinstance(error, DatasetError):
+            raise
         if "already open for write" in str(error):
-            raise DatasetError(f"{path}: another program is writing it, or was killed") from error
+            raise DatasetError(
+                f"{path}: the program that wrote it was killed before it closed it: write it "
+                f"again, or try `h5clear -s {path}`"
+            ) from error
         raise DatasetError(f"{path}: truncated or corrupt HDF5 ({error})") from error
+
+
+def _check_not_in_use(path):
+    """Raise DatasetError if another program has a file open for writing: HDF5 locks it then."""
+    with contextlib.suppress(OSError), open(path, "rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise DatasetError(
+                f"{path}: another program has it open for writing; read it when that has ended"
+            ) from error
 
 
 def attribute(file: h5py.File, name: str) -> Any:

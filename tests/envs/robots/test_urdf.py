@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+import trimesh
 
 import roboarm_nmp.envs.robots.urdf
 from roboarm_nmp.envs.collision.checker import CollisionChecker
@@ -290,6 +291,24 @@ def test_face_with_a_missing_vertex_is_rejected(urdf, face, kind):
         robot_from_urdf(path)
     (path.parent / "x.obj").write_text(tetrahedron)
     assert robot_from_urdf(path).num_joints == 2
+
+
+def test_arm_of_glb_meshes_is_that_of_the_same_obj_meshes(urdf):
+    path = urdf(TWO + joint("1", "a", "b") + link("c", (*MESH[:2], MESH[2].format("m.obj"))))
+    text = path.read_text().replace("</robot>", joint("2", "b", "c") + "</robot>")
+    scene = trimesh.Scene()
+    for height in (0.1, 0.4):  # the hull of both is not the arm
+        place = trimesh.transformations.translation_matrix((0.0, 0.0, height))
+        scene.add_geometry(trimesh.creation.box((0.1, 0.2, 0.05)), transform=place)
+    states, distances = np.random.default_rng(0).uniform(-1, 1, (50, 2)), []
+    obstacles = Scene((Sphere((0.1, 0.1, 0.8), 0.1),), table=None, floor=None)
+    for name in ("m.obj", "m.GLB"):
+        scene.export(str(path.parent / name), file_type=name[-3:].lower())
+        path.write_text(text.replace("m.obj", name))
+        checker = CollisionChecker(dataclasses.replace(obstacles, robot=robot_from_urdf(path)))
+        distances.append(checker.signed_distances(states).distance)
+    np.testing.assert_allclose(*distances, atol=1e-6)
+    assert np.ptp(distances[0][:, -1]) > 0.05
 
 
 @pytest.mark.parametrize(

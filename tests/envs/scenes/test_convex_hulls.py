@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from problem_files import (
     CORNERS,
     CUROBO,
@@ -209,6 +210,22 @@ def test_mesh_of_a_scene_file_becomes_its_hull(name, tmp_path):
     assert_wedge(scene.obstacles)
     save_scene(scene, tmp_path / "hulls.yaml")  # which needs no file of a mesh
     assert load_scene(tmp_path / "hulls.yaml") == scene
+
+
+def test_glb_meshes_are_placed_as_in_their_scene(tmp_path):
+    mesh, place = trimesh.Trimesh(CORNERS, TRIANGLES, process=False), np.eye(4)
+    place[:3, 3] = 1.0, 0.0, 0.0
+    scene = trimesh.Scene({"one": mesh})
+    scene.add_geometry(mesh, transform=place)
+    (tmp_path / "a.glb").write_bytes(contents := scene.export(file_type="glb"))
+    vertices, faces = load_mesh("a.glb", tmp_path)
+    expected = np.concatenate([CORNERS, CORNERS + place[:3, 3]])
+    np.testing.assert_allclose(np.unique(vertices, axis=0), np.unique(expected, axis=0), atol=1e-7)
+    assert len(faces) == 8 and len(mesh_hulls(vertices, faces, (0, 0, 0))) == 2
+    for damaged in (contents[:300], contents.replace(b'"count":4', b'"count":%d' % 4e9)):
+        (tmp_path / "a.glb").write_bytes(damaged)
+        with pytest.raises(MeshError, match=r"a.glb: a damaged GLB file"):
+            load_mesh("a.glb", tmp_path)
 
 
 @pytest.mark.parametrize(
