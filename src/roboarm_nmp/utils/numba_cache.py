@@ -45,6 +45,8 @@ def uncounted(function):
 
 def compiled(function, **options):
     """Numba's `njit`, cached on disk where a folder for that can be written to."""
+    if config.DISABLE_JIT:
+        return function
     dispatcher = numba.njit(nogil=True, error_model="numpy", **options)(function)
     resolve = dispatcher.get_call_template
     # A call with a number in the code, f(a, 0), is one with any integer: no compilation of its own.
