@@ -90,7 +90,10 @@ def _goal(args: Args, robot: Robot, start: np.ndarray) -> dict[str, np.ndarray]:
     if args.goal_pose is not None:
         pose = numbers_in("--goal-pose", args.goal_pose, 7)
         if goal_configuration(robot, pose, start) is None:
-            raise ValueError("--goal-pose: the arm cannot reach it")
+            raise ValueError(
+                "--goal-pose: the arm cannot reach it; move it nearer to the base, or turn it "
+                "(position in m, quaternion x y z w, in the base's frame)"
+            )
         return {"goal_pose": pose}
     return {"goal": configuration_in("--goal", args.goal or "", robot)}
 
@@ -111,7 +114,10 @@ def _check_end(
     depth = -near.distance[link] - point_radius
     if near.geometry[link] == POINT and depth > 0:
         name = robot.link_names[robot.collision_links[link]]
-        raise ValueError(f"{flag} is in collision: a point is {1000 * depth:.0f} mm inside {name}")
+        raise ValueError(
+            f"{flag} is in collision: a point is {1000 * depth:.0f} mm inside {name}; if that is a "
+            f"point of the arm itself, remove it, or check the cloud's --frame and --units"
+        )
 
 
 def _planned(args: Args, scene: Scene, start: np.ndarray, goal: dict) -> tuple[np.ndarray, float]:
@@ -154,7 +160,9 @@ def _rolled_out(
     if goal_pose is not None:
         goal = goal_configuration(scene.robot, goal_pose, start, checker)
     if goal is None:
-        raise ValueError("--goal-pose: the arm reaches it only in collision")
+        raise ValueError(
+            "--goal-pose: the arm reaches it only in collision; move it away from the obstacles"
+        )
     env = envs.make(scene, **options)
     query = Query(start.astype(np.float32), goal.astype(np.float32), scene)
     begin = make_policy(policy, env, args.seed, time_limit=args.time_limit)

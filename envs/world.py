@@ -407,7 +407,10 @@ class World:
             configuration = rng.uniform(self.robot.lower, self.robot.upper).astype(np.float32)
             if self.is_feasible(configuration):
                 return configuration
-        raise RuntimeError(f"no feasible configuration in {MAX_SAMPLING_TRIES} samples")
+        raise RuntimeError(
+            f"no feasible configuration in {MAX_SAMPLING_TRIES} samples: leave the arm more room "
+            f"(`roboarm show` draws the scene)"
+        )
 
     def check_free(
         self, ignoring_motions: Collection[str] = (), **configurations: np.ndarray
@@ -425,7 +428,10 @@ class World:
             if self.in_collision(configuration, moving=moving):
                 contacts = self.contact_names(moving)
                 self._restore(before)
-                raise ValueError(f"{name} is in collision: {contacts}")
+                raise ValueError(
+                    f"{name} is in collision: {contacts}; choose another one, or give an obstacle "
+                    f"that it may touch `may_touch`"
+                )
 
     def contact_names(self, moving: bool = True) -> str:
         """The pairs in contact, in words; after `in_collision`, with the same `moving`."""

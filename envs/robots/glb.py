@@ -41,4 +41,4 @@ def read_glb(contents: bytes) -> list[GlbMesh]:
             for matrix, mesh in meshes
         ]
     except Exception as error:  # damaged files raise all kinds of exceptions
-        raise ValueError(f"a damaged GLB file, or one of another kind: {error}") from error
+        raise ValueError(f"a damaged GLB file, export it again: {error}") from error

@@ -87,4 +87,7 @@ def sample_pairs(
     for configuration, overlapping in zip(configurations, colliding, strict=True):
         if not overlapping - always:
             return pairs, tuple(configuration.tolist())
-    raise RobotError(f"{robot.urdf}: collides with itself in each of {samples} configurations")
+    raise RobotError(
+        f"{robot.urdf}: collides with itself in each of {samples} configurations: name pairs of "
+        f"links that may overlap in an SRDF (`srdf`)"
+    )

@@ -165,7 +165,7 @@ def robot_from_urdf(
     fixed, limits, datasheet_limits = fixed or {}, limits or {}, datasheet_limits or {}
     movable = [joint for joint in tree.joints if tree.is_movable(joint)]
     if not movable:
-        raise tree.error("no joint can move")
+        raise tree.error("no joint can move: give one the type revolute, continuous or prismatic")
     if len(movable) > MAX_MOVABLE:
         raise tree.error(f"{len(movable)} movable joints, at most {MAX_MOVABLE}")
     end_effector = end_effector or tree.likely_end_effector()
@@ -191,7 +191,10 @@ def robot_from_urdf(
     joint_index, link_index, shapes = bullet_indices(path, bullets_xml(xml))
     for link, element in tree.elements.items():
         if shapes[link] < len(element.findall("collision")):
-            raise tree.error(f"link {link!r}: PyBullet cannot use one of its collision shapes")
+            raise tree.error(
+                f"link {link!r}: PyBullet cannot use one of its collision shapes: export its mesh "
+                f"again, or take a box, a cylinder or a sphere"
+            )
     links = []
     for link in filter(tree.is_solid, tree.links):
         frame, rotation, position = placements[link]

@@ -55,7 +55,9 @@ class UrdfTree:
         self.path = path
         self.root = read_xml(path)
         if self.root.tag != "robot":
-            raise self.error("no URDF: its first element is not <robot>")
+            raise self.error(
+                "no URDF: its first element is not <robot> (of xacro files: run `xacro` first)"
+            )
         self.elements = self._by_name("link")
         if not self.elements:
             raise self.error("no links")
@@ -105,7 +107,10 @@ class UrdfTree:
             children.setdefault(joint_end(joint, "parent"), []).append(name)
         tops = [link for link in self.elements if link not in self._parent]
         if len(tops) != 1:
-            raise self.error(f"{len(tops)} links without a parent, there must be one base")
+            raise self.error(
+                f"{len(tops)} links without a parent, there must be one base: connect the others "
+                f"by fixed joints ({', '.join(tops)[:200]})"
+            )
         self.links.append(tops[0])
         for link in self.links:  # grows
             for name in children.get(link, ()):
@@ -139,7 +144,9 @@ class UrdfTree:
         for name, joint in self.joints.items():
             kind = joint.get("type")
             if kind not in (*MOVABLE, "fixed"):
-                raise self.error(f"joint {name!r} has type {kind!r}, not {MOVABLE} or fixed")
+                raise self.error(
+                    f"joint {name!r} has type {kind!r}, not {MOVABLE} or fixed: choose one"
+                )
             if kind == "fixed":
                 continue
             axis = joint_axis(joint)
@@ -185,7 +192,8 @@ class UrdfTree:
                     contents = file.read_bytes()
                     if file.suffix.lower() == ".obj" and not _has_its_vertices(contents):
                         raise self.error(
-                            f"link {name!r}: a face of mesh {file} has a vertex that is not there"
+                            f"link {name!r}: a face of mesh {file} has a vertex that is not there: "
+                            f"export it again"
                         )
                     parts = self._glb_parts(name, file, contents)
                     if kind == "visual":
@@ -221,7 +229,7 @@ class UrdfTree:
         if not any(file.is_relative_to(folder) for folder in folders):
             raise self.error(f"{where} is outside of {folders[0]}: name its folder in `packages`")
         if file.suffix.lower() not in MESH_ENDINGS:
-            raise self.error(f"{where}: must end in {', '.join(MESH_ENDINGS)}")
+            raise self.error(f"{where}: must end in {', '.join(MESH_ENDINGS)}: convert it")
         if not file.is_file():
             hint = ": name its folder in `packages`" if name.startswith("package://") else ""
             raise self.error(f"{where}: no such file ({file}){hint}")

@@ -571,7 +571,7 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
         raise DatasetError(f"{path}: {error.strerror}") from error
     if not h5py.is_hdf5(path):
         _check_not_in_use(path)
-        raise DatasetError(f"{path}: not an HDF5 file")
+        raise DatasetError(f"{path}: not an HDF5 file: name a query or demonstration file (.h5)")
     try:
         # Our files are replaced as a whole, so they need no locks, which not every file system has.
         with h5py.File(path, "r", locking=False) as file:
@@ -585,7 +585,9 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
                 f"{path}: the program that wrote it was killed before it closed it: write it "
                 f"again, or try `h5clear -s {path}`"
             ) from error
-        raise DatasetError(f"{path}: truncated or corrupt HDF5 ({error})") from error
+        raise DatasetError(
+            f"{path}: truncated or corrupt HDF5 ({error}): copy it again, or make it again"
+        ) from error
 
 
 def _check_not_in_use(path):

@@ -368,7 +368,7 @@ def _make_job(
             if not by_kinematics:
                 raise EvaluationError(
                     f"{policy} was trained with the goal type {trained_with!r}, it cannot be "
-                    f"evaluated with {options.goal_type!r}"
+                    f"evaluated with {options.goal_type!r}: leave out --goal-type"
                 )
         options = replace(options, env=trained or options.env)
     problems = None
@@ -422,12 +422,18 @@ def _with_one_goal(problem: Problem) -> Problem:
     if problem.goal_pose is not None and not len(problem.goals):
         goal = goal_configuration(robot, problem.goal_pose, problem.start, checker)
         if goal is None:
-            raise EvaluationError(f"problem {problem.name}: its goal pose cannot be reached freely")
+            raise EvaluationError(
+                f"problem {problem.name}: its goal pose cannot be reached freely; leave it out, or "
+                f"give another goal"
+            )
         return problem._replace(goals=goal[None].astype(np.float64))
     states = robot.normalise(problem.goals)
     free = np.flatnonzero(checker.is_free(np.clip(states, -1.0, 1.0), margin=LEAST_CLEARANCE))
     if not len(free):
-        raise EvaluationError(f"problem {problem.name}: all of its goals are in collision")
+        raise EvaluationError(
+            f"problem {problem.name}: all of its goals are in collision; leave it out, or give "
+            f"another goal"
+        )
     distances = np.linalg.norm(states[free] - robot.normalise(problem.start), axis=1)
     return problem._replace(goals=problem.goals[free[distances.argmin()]][None])
 
@@ -461,7 +467,9 @@ def _in_use(policy, options):
     if policy == SPACE_TIME or (source is None and encoder is None):
         for name in ("observe_every", "sensor_noise"):
             if getattr(options, name) is not None:
-                raise EvaluationError(f"{name}: this policy observes nothing of the scene")
+                raise EvaluationError(
+                    f"{name}: this policy observes nothing of the scene; leave it out"
+                )
     noise = options.sensor_noise
     if noise is not None and noise.changes_images and not _uses_sensors(source, encoder):
         raise EvaluationError(
@@ -485,7 +493,9 @@ def _queries(task, options):
         queries = load_queries(queries, options.split, task)
     name = task_name(task)
     if getattr(queries, "task", name) != name:
-        raise EvaluationError(f"these queries are for the task {queries.task!r}, not {name!r}")
+        raise EvaluationError(
+            f"these queries are for the task {queries.task!r}, not {name!r}: evaluate on that task"
+        )
     available = len(queries.start)
     if options.num_queries is not None and not 1 <= options.num_queries <= available:
         raise EvaluationError(f"num_queries must be 1 to {available}, got {options.num_queries}")

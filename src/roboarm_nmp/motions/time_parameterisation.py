@@ -147,7 +147,7 @@ def _trajectory(polyline, deviation, bounds, step, robot, path, checker, margin)
         if not near.any():
             raise ValueError(
                 f"the path itself collides, {first[0]:.3f} rad (L2) after its start, of "
-                f"{polyline.lengths[-1]:.3f}"
+                f"{polyline.lengths[-1]:.3f}; plan it anew, or time it with a smaller margin"
             )
         half_widths = np.where(near, SHRINK * half_widths, half_widths)
         half_widths[half_widths < least] = 0.0

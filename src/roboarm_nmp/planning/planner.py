@@ -253,7 +253,7 @@ class Planner:
         if best is None:
             raise PlanningError(
                 f"no path in {self.checks} collision checks (time_limit {time_limit} s, max_checks "
-                f"{self.max_checks})"
+                f"{self.max_checks}); more time, or another seed, may find one"
             )
         if optimise:
             best = self._optimised(query, best, optimise, rng, deadline)
@@ -353,7 +353,10 @@ class Planner:
             if len(goals):
                 break
         else:
-            raise PlanningError("no collision-free configuration has the goal pose")
+            raise PlanningError(
+                "no collision-free configuration has the goal pose: move it away from the "
+                "obstacles, or into the arm's reach"
+            )
         goals = np.asarray(goals, dtype=np.float32)
         states = np.clip(robot.normalise(goals), -1.0, 1.0)
         for clearance in (self.margin + self.clearance, self.margin, EXACTNESS):

@@ -332,7 +332,10 @@ def _trained(path, env, seed, search):
         raise PolicyError(str(error)) from error
     mode = trained.get("action_mode", "relative")
     if mode != env.action_mode:
-        raise PolicyError(f"{path}: its actions are of mode {mode!r}, not {env.action_mode!r}")
+        raise PolicyError(
+            f"{path}: its actions are of mode {mode!r}, not {env.action_mode!r}: make the "
+            f"environment with action_mode={mode!r}"
+        )
 
     if "paths" in network.metadata:
         # Here, because Numba takes a while to import.
@@ -377,7 +380,10 @@ def _trained(path, env, seed, search):
     if size:
         unknown -= {"recurrent_state"}
     if unknown:
-        raise PolicyError(f"{path}: needs {', '.join(sorted(unknown))}, which is not observed")
+        raise PolicyError(
+            f"{path}: needs {', '.join(sorted(unknown))}, which is not observed: make the "
+            f"environment with the arguments that it was trained with, `roboarm policies` has them"
+        )
     for name, shape in network.inputs.items():
         if name in example and example[name].shape != shape[1:]:
             raise PolicyError(

@@ -63,7 +63,7 @@ def check_finite(name: str, values: torch.Tensor | np.ndarray) -> None:
         values: tensor or array.
     """
     if not torch.as_tensor(values).isfinite().all():
-        raise FloatingPointError(f"{name} are no longer finite")
+        raise FloatingPointError(f"{name} are no longer finite: lower --learning-rate")
 
 
 def script_name() -> str:

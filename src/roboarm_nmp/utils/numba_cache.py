@@ -25,8 +25,9 @@ from pathlib import Path
 
 import numba
 from llvmlite.binding import get_host_cpu_name
-from numba.core import config, types
+from numba.core import compiler, config, sigutils, types, typing
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.codegen import JITCodeLibrary
 from numba.core.serialize import dumps
 
 from roboarm_nmp.utils.files import cache_folder
@@ -48,12 +49,8 @@ def compiled(function, **options):
     if config.DISABLE_JIT:
         return function
     dispatcher = numba.njit(nogil=True, error_model="numpy", **options)(function)
-    resolve = dispatcher.get_call_template
-    # A call with a number in the code, f(a, 0), is one with any integer: no compilation of its own.
-    dispatcher.get_call_template = lambda args, kws: resolve(
-        tuple(types.unliteral(kind) for kind in args),
-        {name: types.unliteral(kind) for name, kind in kws.items()},
-    )
+    inner = _Inner(dispatcher)
+    dispatcher.get_call_template, dispatcher.get_overload = inner.get_call_template, inner.get_key
     folder = config.CACHE_DIR
     # (RuntimeError: no folder can be written to. OSError: there is no home folder.)
     with contextlib.suppress(RuntimeError, OSError):
@@ -63,6 +60,60 @@ def compiled(function, **options):
         finally:
             config.CACHE_DIR = folder
     return dispatcher
+
+
+class _Inner:
+    """A compiled function as other compiled functions call it: its code becomes part of theirs.
+
+    By itself, Numba makes machine code of each function that is called, too, which nobody runs, and
+    optimises what that one calls once more in each caller's caller.
+    """
+
+    def __init__(self, dispatcher):
+        self._dispatcher = dispatcher
+        self._compiled = {}  # of tuples of arguments' types, a signature and Numba's key
+
+    def get_call_template(self, args, kws):
+        """As of a dispatcher: a template, the Python signature, arguments' types, and {}."""
+        pysig, args = self._dispatcher._compiler.fold_argument_types(args, kws)
+        # A call with a number in the code, f(a, 0), is one with any integer.
+        args = tuple(types.unliteral(kind) for kind in args)
+        if args not in self._compiled:
+            self._compiled[args] = self._compile(args)
+        name = self._dispatcher.py_func.__name__
+        signatures = [self._compiled[args][0]]
+        template = typing.make_concrete_template(name, key=name, signatures=signatures)
+        return template, pysig, args, {}
+
+    def get_key(self, sig):
+        """The key under which Numba knows the function of a signature's arguments."""
+        return self._compiled[tuple(sigutils.normalize_signature(sig)[0])][1]
+
+    def _compile(self, args):
+        target = self._dispatcher.targetdescr
+        flags = compiler.Flags()
+        target.options.parse_as_flags(flags, self._dispatcher.targetoptions)
+        flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
+        function = self._dispatcher.py_func
+        context = target.target_context
+        library = _LinkedLibrary(context.codegen(), function.__qualname__)
+        result = compiler.compile_extra(
+            target.typing_context, context, function, args, None, flags, {}, library
+        )
+        key = object()
+        context.insert_user_function(key, result.fndesc, [library])
+        return result.signature, key
+
+
+class _LinkedLibrary(JITCodeLibrary):
+    """Code that is linked into other functions', and optimised and made machine code there."""
+
+    def _optimize_final_module(self):
+        pass
+
+    def _finalize_final_module(self):
+        self._finalize_dynamic_globals()
+        self._finalized = True
 
 
 @functools.cache
