@@ -56,7 +56,9 @@ def _add_face(s, faces, n, a, b, c):
         squared += f[3 + i] * f[3 + i]
     f[6] = FAR  # of a face without an area, which is never the nearest
     if squared > 1e-30:
-        f[3:6] /= math.sqrt(squared)
+        norm = math.sqrt(squared)
+        for i in range(3, 6):
+            f[i] /= norm
         f[6] = f[3] * s[a, 0] + f[4] * s[a, 1] + f[5] * s[a, 2]
     return n + 1
 
@@ -111,7 +113,8 @@ def _epa(vertices, cells, k, rows, j, pose, s, points, faces, edges):
                     edges[num_edges, 0], edges[num_edges, 1] = a, b
                     num_edges += 1
             num_faces -= 1
-            faces[f, :] = faces[num_faces, :]
+            for i in range(7):
+                faces[f, i] = faces[num_faces, i]
         for e in range(num_edges):
             num_faces = _add_face(points, faces, num_faces, edges[e, 0], edges[e, 1], num_points)
         num_points += 1

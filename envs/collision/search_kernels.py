@@ -22,6 +22,7 @@ from roboarm_nmp.envs.collision.shortening_kernels import (
     is_path_clear,
     random_share,
     shortened,
+    write_row,
 )
 from roboarm_nmp.utils.numba_cache import compiled, uncounted
 
@@ -98,7 +99,8 @@ def _search(
             phase += 1
         rule, margins = numbers[phase], endpoints[phase]
         if samples < m:  # first the goals themselves
-            target[:] = goals[samples]
+            for j in range(n):
+                target[j] = goals[samples, j]
             tree = 0
         else:
             for j in range(n):
@@ -180,11 +182,11 @@ def _joined_path(nodes, parents, a, b):
     path = np.empty((length, nodes.shape[2]))
     node = a
     for i in range(before - 1, -1, -1):
-        path[i] = nodes[0, node]
+        write_row(path, i, nodes[0, node])
         node = parents[0, node]
     node = parents[1, b]
     for i in range(before, length):
-        path[i] = nodes[1, node]
+        write_row(path, i, nodes[1, node])
         node = parents[1, node]
     return path
 

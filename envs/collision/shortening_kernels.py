@@ -21,6 +21,21 @@ def random_share(random):
 
 
 @uncounted
+def write_row(rows, i, row):
+    """`rows[i] = row`, without the code of a wrong shape's message, which takes 2 s to compile."""
+    for j in range(row.shape[0]):
+        rows[i, j] = row[j]
+
+
+@uncounted
+def _move(rows, begin, end, to):
+    """Move the rows from `begin` to `end` - 1, to row `to` and on."""
+    for i in range(end - begin):
+        k = i if to < begin else end - begin - 1 - i  # none is overwritten before it is moved
+        write_row(rows, to + k, rows[begin + k])
+
+
+@uncounted
 def _distance(a, b):
     squared = 0.0
     for j in range(a.shape[0]):
@@ -71,13 +86,14 @@ def shortened(path, chords, random, certain, rule, margins, arm, arm32, world, g
             )
             checks += abs(more)
             if more > 0:
-                path[i + 1 : count - (j - i - 1)] = path[j:count].copy()
+                _move(path, j, count, i + 1)
                 count -= j - i - 1
                 break
         i += 1
     # Each chord adds a vertex at most.
     points, along = np.empty((count + chords, n)), np.zeros(count + chords)
-    points[:count] = path[:count]
+    for i in range(count):
+        write_row(points, i, path[i])
     begin, end = np.empty(n), np.empty(n)
     for _ in range(chords):
         if count < 3:
@@ -93,9 +109,9 @@ def shortened(path, chords, random, certain, rule, margins, arm, arm32, world, g
         checks += abs(more)
         if more > 0:
             # The vertices up to `first`, the chord's ends, the vertices from `last` + 1 on.
-            points[first + 3 : first + 3 + count - last - 1] = points[last + 1 : count].copy()
-            points[first + 1] = begin
-            points[first + 2] = end
+            _move(points, last + 1, count, first + 3)
+            write_row(points, first + 1, begin)
+            write_row(points, first + 2, end)
             count += 2 - (last - first)
     return points[:count].copy(), checks
 

@@ -99,6 +99,10 @@ class Validity:
         """Whether the limits of this plan are reached."""
         return self.checks >= self._max_checks or time.monotonic() > self._deadline
 
+    def postpone(self, seconds: float) -> None:
+        """Let this plan take longer by so many seconds."""
+        self._deadline += seconds
+
     def restore_margins(self) -> None:
         """Return to the full margins, for changes to a path that has been found."""
         self._use_rule(0)

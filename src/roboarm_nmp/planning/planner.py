@@ -38,6 +38,7 @@ from roboarm_nmp.envs.collision.checker import (
     CollisionChecker,
     Rules,
 )
+from roboarm_nmp.envs.collision.hulls import MAX_MARGIN
 from roboarm_nmp.envs.robots.inverse_kinematics import NUM_SEEDS, inverse_kinematics
 from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.scenes.primitives import Scene, obstacle_at
@@ -172,9 +173,9 @@ class Planner:
         self._checker = geometry_source(env.scene.at(0.0))
         # Compile here what is compiled at its first call: a plan's time is for planning.
         state = np.zeros(env.robot.num_joints)
-        self._checker.signed_distances(state)
-        self._checker.motion_checker()(tuple(state), tuple(state))
-        self._checker.find_path(state, state, np.random.default_rng(0), max_checks=1)
+        self._checker.is_free(state)
+        if planner == COMPILED:
+            self._checker.find_path(state, state, np.random.default_rng(0), max_checks=1)
         self.checks = 0
         """Collision checks of the last plan."""
 
@@ -373,7 +374,10 @@ class Planner:
         """
         ends = np.concatenate([start[None], goals])
         states = np.clip(checker.robot.normalise(ends), -1.0, 1.0).astype(np.float64)
-        distances = checker.end_distances(states, self.margin + self.clearance + EXACTNESS)
+        within = self.margin + self.clearance + EXACTNESS
+        distances = np.full((2, len(states)), math.inf)
+        if within >= MAX_MARGIN or not checker.is_free(states, margin=within).all():
+            distances = checker.end_distances(states, within)
         if self.limits != "urdf" or distances[0].min() < 0.0:
             problems = [self._problem(checker, ends[0], states[0], set())]
             # From a goal, obstacles may move away.
@@ -426,6 +430,9 @@ class Planner:
         with contextlib.ExitStack() as locks:
 
             def ompl_search():
+                began = time.monotonic()
+                checker.motion_checker()(tuple(start), tuple(start))  # it may have to be compiled
+                is_valid.postpone(time.monotonic() - began)
                 locks.enter_context(OMPL_LOCK)
                 return OmplSearch(is_valid, self._bounds, self.planner_range, start, goals, seed)
 
