@@ -12,6 +12,7 @@ import math
 
 import numpy as np
 
+from roboarm_nmp.envs.collision.arm_kernels import write_row
 from roboarm_nmp.utils.numba_cache import compiled
 
 AMPLITUDE, FREQUENCY, PHASE, AXIS, ANGLE = 7, 10, 11, 12, 15
@@ -45,7 +46,7 @@ def moved_rows(motions, centres, shapes, t, rows):
     for i in range(shapes.shape[0]):
         obstacle_state(motions, i, t, pose, velocity)
         row = rows[i]
-        row[:] = shapes[i]
+        write_row(rows, i, shapes[i])
         x, y, z, w = pose[3], pose[4], pose[5], pose[6]
         norm = math.sqrt(x * x + y * y + z * z + w * w)
         x, y, z, w = x / norm, y / norm, z / norm, w / norm

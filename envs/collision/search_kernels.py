@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 
+from roboarm_nmp.envs.collision.arm_kernels import write_row
 from roboarm_nmp.envs.collision.continuous_kernels import continuous_memory, is_motion_clear
 from roboarm_nmp.envs.collision.edge_kernels import block_memory, check_motion
 from roboarm_nmp.envs.collision.lanes_kernels import (
@@ -22,7 +23,6 @@ from roboarm_nmp.envs.collision.shortening_kernels import (
     is_path_clear,
     random_share,
     shortened,
-    write_row,
 )
 from roboarm_nmp.utils.numba_cache import compiled, uncounted
 

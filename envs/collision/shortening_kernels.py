@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from roboarm_nmp.envs.collision.arm_kernels import write_row
 from roboarm_nmp.envs.collision.continuous_kernels import is_motion_clear
 from roboarm_nmp.envs.collision.edge_kernels import check_motion
 from roboarm_nmp.utils.numba_cache import compiled, uncounted
@@ -18,13 +19,6 @@ def random_share(random):
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     z = z ^ (z >> np.uint64(31))
     return (z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
-
-
-@uncounted
-def write_row(rows, i, row):
-    """`rows[i] = row`, without the code of a wrong shape's message, which takes 2 s to compile."""
-    for j in range(row.shape[0]):
-        rows[i, j] = row[j]
 
 
 @uncounted

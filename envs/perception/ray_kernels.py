@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.arm_kernels import FAR, place_arm
+from roboarm_nmp.envs.collision.arm_kernels import FAR, place_arm, write_row
 from roboarm_nmp.utils.numba_cache import compiled
 
 # Columns of a surface: its shape, the frame that moves it (-1: none), its position there 3, its
@@ -136,7 +136,7 @@ def _clip(view, height, width, polygon, n):
     for i in range(n):
         one, other = corners[i], corners[(i + 1) % n]
         if one[2] >= view[NEAREST]:
-            left[count] = one
+            write_row(left, count, one)
             count += 1
         if (one[2] >= view[NEAREST]) != (other[2] >= view[NEAREST]):
             share = (view[NEAREST] - one[2]) / (other[2] - one[2])
