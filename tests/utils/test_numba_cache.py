@@ -115,7 +115,7 @@ def test_cache_is_in_the_user_folder_and_the_first_compilation_is_announced_once
     outputs = [process.communicate() for process in at_once]
     assert [process.returncode for process in at_once] == [0, 0], outputs
     lines = "".join(error for _, error in outputs).splitlines()
-    assert lines == ["compiling once, one to two minutes (roboarm compile: for all commands)"]
+    assert lines == ["compiling once, about half a minute (roboarm compile: for all commands)"]
     assert begin("small", folder, **variables).communicate() == ("12.0 12\n", "")
     assert list(tmp_path.glob("numba/*/small.quadruple*.nbc"))
 
@@ -143,17 +143,18 @@ def test_compiled_functions_are_in_files_that_the_cache_watches():
 
 
 @compiled
-def _sum(a, b):
+def _sum(a, b=1):
     return a + b
 
 
 @compiled
 def _sums(a):
-    return _sum(a, 0) + _sum(3, a) + _sum(a, a)
+    return _sum(a, 0) + _sum(3, a) + _sum(a) + _sum(a, b=0.5)
 
 
-def test_numbers_in_calls_need_no_compilation_of_their_own():
-    assert _sums(2) == 11 and len(_sum.signatures) == 1
+def test_called_functions_are_part_of_their_callers_and_can_be_called():
+    assert _sums(2) == 12.5 and not _sum.signatures
+    assert _sum(2) == 3 and _sum(2, b=0.5) == 2.5
 
 
 def test_compile_has_something_to_do_once(tmp_path, monkeypatch, capsys):

@@ -146,7 +146,7 @@ def _announce_compilation(folder):
         _lock = open(Path(folder, "compiling"), "wb")  # noqa: SIM115
         fcntl.flock(_lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if _on_compilation is None:
-            write_line("compiling once, one to two minutes (roboarm compile: for all commands)")
+            write_line("compiling once, about half a minute (roboarm compile: for all commands)")
 
 
 _on_compilation: Callable[[], None] | None = None

@@ -38,6 +38,23 @@ def _evaluate():
     evaluate(POLICY, TASK, num_queries=1)
 
 
+def _check():
+    # Here, because Numba takes a while to import.
+    from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker, Rules
+
+    query = load_queries(TASK)[0]
+    checker = CollisionChecker(query.scene)
+    state = query.scene.robot.normalise(query.start).astype(np.float64)
+    checker.signed_distances(state)
+    checker.end_distances(state[None], 0.01)
+    checker.is_motion_free(state, state)
+    checker.is_motion_free(state, state, continuous=True)
+    checker.motion_checker()(tuple(state), tuple(state))
+    numbers, no_ends = np.array([[0.0, 0.0, 0.0, RESOLUTION]]), np.empty((1, 0, 1 + len(state)))
+    rules = Rules(np.zeros(1, np.int64), numbers, no_ends)
+    checker.finish_path(np.stack([state, state]), rules, seed=0, chords=0)
+
+
 def _plan():
     query = load_queries(TASK)[0]
     _plan_in(query.scene, query.start, query.goal)
@@ -61,6 +78,7 @@ def _plan_in(scene, start, goal):
 
 
 PARTS: dict[str, Callable[[], None]] = {
+    "checks": _check,
     "evaluation": _evaluate,
     "plan": _plan,
     "plan among points": _plan_among_points,

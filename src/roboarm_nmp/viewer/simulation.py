@@ -308,7 +308,7 @@ class PolicyArm(Arm):
         self._seconds = 0.0  # of all actions
 
     def compile(self):
-        """Have Numba compile what this arm needs, half a minute for the first time on a machine.
+        """Have Numba compile what this arm needs, if `roboarm compile` has not.
 
         Other threads may use other arms meanwhile.
         """
