@@ -120,13 +120,6 @@ class _Flags(compiler.Flags):
 class _LinkedLibrary(JITCodeLibrary):
     """Code that is linked into other functions', and optimised and made machine code there."""
 
-    def _optimize_functions(self, ll_module):
-        ll_module.data_layout = self._codegen._data_layout
-        manager, builder = self._codegen._function_pass_manager()
-        for function in ll_module.functions:
-            if not function.is_declaration:
-                manager.run(function, builder)
-
     def _optimize_final_module(self):
         pass
 
