@@ -9,7 +9,7 @@ Numba compiles a function again when the file that it stands in changes, but not
 constants change that it uses from other files. Here an entry also counts as old when any of the
 package's compiled files changes, all of which have names that end in `kernels.py`.
 """
-# pyright: reportAttributeAccessIssue=false
+# pyright: reportAttributeAccessIssue=false, reportPrivateImportUsage=false
 # (Numba's settings and dispatchers have attributes that their types lack.)
 
 import contextlib
