@@ -62,7 +62,7 @@ class Body:
 
         `colour`: (red, green, blue, alpha) in [0, 1].
         """
-        root = parsed_urdf(robot)
+        root = _without_glb(parsed_urdf(robot))
         for link in root.iter("link"):
             for visual in link.findall("visual"):
                 link.remove(visual)
@@ -222,10 +222,10 @@ def parsed_urdf(robot: Robot) -> ElementTree.Element:
 
 
 def collision_elements(robot: Robot, link: str) -> list[ElementTree.Element]:
-    """The URDF's `collision` elements of a link, by its name."""
+    """The URDF's `collision` elements of a link, by its name, as PyBullet reads them."""
     for element in parsed_urdf(robot).findall("link"):
         if element.get("name") == link:
-            return element.findall("collision")
+            return _without_glb(element).findall("collision")
     raise ValueError(f"{robot.name} has no link {link!r}")
 
 
@@ -246,12 +246,15 @@ def bullets_xml(text: str) -> str:
     """The text of a URDF with absolute paths, with OBJ files in the place of GLB files."""
     if ".glb" not in text.lower():
         return text
-    root = ElementTree.fromstring(text)
-    for mesh in root.iter("mesh"):
+    return ElementTree.tostring(_without_glb(ElementTree.fromstring(text)), "unicode")
+
+
+def _without_glb(element):
+    for mesh in element.iter("mesh"):
         path = mesh.get("filename", "")
         if path.lower().endswith(".glb"):
             mesh.set("filename", obj_of_glb(path))
-    return ElementTree.tostring(root, "unicode")
+    return element
 
 
 def resolve(

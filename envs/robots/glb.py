@@ -30,7 +30,7 @@ def read_glb(contents: bytes) -> list[GlbMesh]:
         scene: Any = trimesh.load_scene(
             io.BytesIO(contents), file_type="glb", process=False, skip_materials=True
         )
-        placed = [scene.graph.get(node) for node in scene.graph.nodes_geometry]
+        placed = [scene.graph.get(node) for node in sorted(scene.graph.nodes_geometry)]
         meshes = [(matrix, scene.geometry[name]) for matrix, name in placed]
         meshes = [(matrix, mesh) for matrix, mesh in meshes if hasattr(mesh, "faces")]
         triangles = sum(len(mesh.faces) for _, mesh in meshes)
