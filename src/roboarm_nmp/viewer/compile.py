@@ -39,8 +39,7 @@ def _evaluate():
 
 
 def _check():
-    # Here, because Numba takes a while to import.
-    from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker, Rules
+    from roboarm_nmp.envs.collision.checker import CollisionChecker  # Numba takes a while
 
     query = load_queries(TASK)[0]
     checker = CollisionChecker(query.scene)
@@ -50,9 +49,6 @@ def _check():
     checker.is_motion_free(state, state)
     checker.is_motion_free(state, state, continuous=True)
     checker.motion_checker()(tuple(state), tuple(state))
-    numbers, no_ends = np.array([[0.0, 0.0, 0.0, RESOLUTION]]), np.empty((1, 0, 1 + len(state)))
-    rules = Rules(np.zeros(1, np.int64), numbers, no_ends)
-    checker.finish_path(np.stack([state, state]), rules, seed=0, chords=0)
 
 
 def _plan():
