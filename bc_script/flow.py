@@ -73,8 +73,8 @@ class Args(RunArgs):
     task: str = "random_boxes_hard"
     """a task of `roboarm_nmp.TASKS` or a scene file, in whose validation scenes the policy is
     evaluated; with another arm TASK@FILE, a robot's file"""
-    goal_type: Literal["config"] = "config"
-    """goals are configurations"""
+    goal_type: Literal["combined"] = "combined"
+    """what the goal is: a configuration, which is reached where the end effector is"""
     paths: tuple[Path, ...] = ()
     """learn from these folders of roadmap paths (`roboarm roadmaps`), in scenes of any tasks of the
     same robot, instead of making roadmaps in new scenes of the task"""

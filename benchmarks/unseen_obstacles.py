@@ -88,7 +88,7 @@ for _name, _policy, _filter, _source in (
         _name: _flags,  # its own filter
     }
 FLOW = "flow, point_cloud"
-CELLS[FLOW] = ["--policy", "flow-config-point_cloud-wide_scenes-s1"]
+CELLS[FLOW] = ["--policy", "flow-combined-point_cloud-wide_scenes-s1"]
 CELLS[f"{FLOW}, search"] = [*CELLS[FLOW], "--search"]
 # Decoded points are less exact than observed ones.
 CELLS[DECODED] = [*CELLS[DECODED], "--safety-margin", "0.015"]

@@ -39,6 +39,8 @@ The goal is a configuration and its end-effector position. The test scenes do no
 An observation of ground-truth obstacles is privileged: a robot does not have it.
 `roadmap-bc-combined-point_cloud-containers-s1` learned in `containers` and `random_boxes_hard`; its
 filter has [approach paths](../guide/safety_filter.md#approach-paths).
+`flow-combined-point_cloud-wide_scenes-s1` learned in [wide scenes](../benchmark/wide_scenes.md) and
+in `random_boxes_hard`; it [draws and verifies paths](../algorithms/flow.md) before it moves.
 Policies in scenes of other kinds: [unseen obstacles](../benchmark/unseen_obstacles.md)."""
 ENCODERS = """\
 An encoder's name is a value of `--encoder`; an encoder with a decoder is also a geometry source

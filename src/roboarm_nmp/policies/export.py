@@ -125,7 +125,7 @@ def save_path_policy(
         for name, shape in (shapes | {"scene": (3 * num_points,)}).items()
     }
     arguments = {
-        "goal_type": "config",
+        "goal_type": "combined",
         "encoder": "point_cloud",
         "num_points": num_points,
         "geometry_source": "point_cloud",
