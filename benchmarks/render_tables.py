@@ -18,8 +18,9 @@ FIXED = ("wall", "double_walls")
 REMARK = (
     "Success is reaching the goal, contacts allowed. Go-to-goal moves straight to the goal. "
     "Roadmap BC has a safety filter and receives link distances from the same source as its "
-    "observation. The paper's policies have neither. Only the last two methods of "
-    "`random_boxes_hard` search for a path before they move. Most rows are from one training seed; "
+    "observation; flow has the filter, and verifies the path that it draws. The paper's policies "
+    "have neither. Only the last three methods of `random_boxes_hard` search for a path before "
+    "they move, the first of them where it can verify none. Most rows are from one training seed; "
     "BC, and SAC on `wall`, are from three."
 )
 
@@ -50,6 +51,8 @@ def results_table():
         cells[bc].mean)  # fmt: skip
     add(HARD, "roadmap BC", f"{code} (field)", "yes", [hard["roadmap BC, decoded by field"]], None)
     add(HARD, "roadmap BC", "point cloud", "yes", [hard["roadmap BC, point_cloud"]], None)
+    add(HARD, "flow", "point cloud", "yes", [hard["flow, point_cloud"]], None)
+    add(HARD, "flow, else search", "point cloud", "yes", [hard["flow, point_cloud, search"]], None)
     add(HARD, "plan from the point cloud", "point cloud", "no",
         [hard["plan from the point cloud"]], None)  # fmt: skip
     add(HARD, "RRT-Connect", privileged, "no", [hard["RRT-Connect, 5 s"]], None)
