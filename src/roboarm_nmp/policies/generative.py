@@ -39,7 +39,7 @@ INACCURACY = 0.01  # m: of a field's distances
 MOST_KNOTS = 1_000  # of a path in a file
 MOST_CHECKED = 40  # times that motions of assembled paths are checked
 CHORDS = 40  # straight motions that are tried to shorten the chosen path
-SEARCH_CHECKS = 20_000  # of a search, in each margin
+SEARCH_CHECKS = 200_000  # of a search, in each margin
 
 
 class Generative:
