@@ -122,7 +122,7 @@ class Args(RunArgs):
     bf16: bool | None = None
     """train with hidden layers in bfloat16; by default where the hardware has it"""
 
-    safety_margin: flags.NonNegativeFloat = 0.01
+    safety_margin: flags.NonNegativeFloat = 0.003
     """minimum clearance of the links, m, of the safety filter in the saved policy"""
 
     eval_every: flags.PositiveInt = 5_000
