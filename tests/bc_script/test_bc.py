@@ -70,7 +70,7 @@ def test_policy_overfits_five_demonstrations_and_follows_them(tmp_path, short_ep
     flags += " --task no_obstacles --goal-type combined --learning-rate 3e-3 --policy-average 0.01"
     run = run_script("bc", tmp_path, *flags.split())
     env, demos = envs.make("no_obstacles", goal_type="combined"), load_demos("no_obstacles")
-    act, _ = make_policy(run / "policy.onnx", env)(0, None)
+    act, *_ = make_policy(run / "policy.onnx", env)(0, None)
     for i in range(5):
         observation, _ = env.reset_specific(demos.start[i], demos.goal[i])
         over = False

@@ -136,10 +136,10 @@ def test_saved_policy_has_its_safety_filter_and_acts_alone_as_in_a_batch(setting
     together = network(**{name: torch.tensor(rows) for name, rows in stacked.items()}).numpy()
     changed = 0
     for row, observation in enumerate(observations):
-        act, _ = make_policy(path, env, safety_filter=False)(0, None)
+        act, *_ = make_policy(path, env, safety_filter=False)(0, None)
         np.testing.assert_allclose(act(observation), together[row], atol=1e-6)
         env.reset(seed=row)  # the filter checks where an action leads from here
-        safe, _ = make_policy(path, env)(0, None)
+        safe, *_ = make_policy(path, env)(0, None)
         filtered = safety_filter.filter_policy(act, env, None)(observation)
         np.testing.assert_array_equal(safe(observation), filtered)
         changed += np.abs(filtered - together[row]).max() > 1e-4
@@ -233,7 +233,7 @@ def test_goal_poses_are_imitated_saved_and_evaluated(tmp_path, folder, short_epi
     path, arguments = find_policy(run)
     env = envs.make(HARD, **arguments)
     observation, _ = env.reset(seed=0)
-    act, _ = make_policy(path, env)(0, None)
+    act, *_ = make_policy(path, env)(0, None)
     assert 0.0 < np.linalg.norm(act(observation)) <= 0.03 + 1e-6
     env.close()
 

@@ -91,7 +91,7 @@ def test_policy_runs_with_onnx_runtime_alone(tmp_path, capsys):
     start = np.array([0.0, -0.4, 0.0, -2.2, 0.0, 1.8, 0.8])
     goal = np.array([1.2, 0.1, 0.2, -1.9, 0.1, 2.0, 0.9])
     observation, _ = env.reset_specific(start, goal)
-    act, _ = make_policy(file, env)(0, None)
+    act, *_ = make_policy(file, env)(0, None)
     action = act(observation)
     action *= min(1.0, env.max_step / np.linalg.norm(action))
     expected = env.robot.denormalise(env.robot.normalise(start) + action)
