@@ -99,7 +99,10 @@ class Args(RunArgs, EnvArgs):
     horizon: flags.Horizon = 400
     """steps after which an episode of the training is truncated"""
     stop_on_collision: bool = False
-    """end an episode of the training at the first contact"""
+    """end an episode of the training at the first contact; as every step costs 1, a contact then
+    costs less than a long way to the goal, unless --contact-cost makes up for it"""
+    contact_cost: flags.NonNegativeFloat = 0.0
+    """taken off the reward of each step with a contact"""
     updates_per_step: flags.NonNegativeFloat = 0.5
     """updates of the critics per environment step (CleanRL: 1)"""
     batch_size: flags.PositiveInt = 256
@@ -115,7 +118,8 @@ class Args(RunArgs, EnvArgs):
     """demonstration files of the task, to use with --demo-prob; by default the task's own"""
     bc_weight: flags.NonNegativeFloat = 0.0
     """with --demo-prob, weight of behavioural cloning in the policy's loss: the squared difference
-    from demonstrated actions, in units of the action scale (Fujimoto and Gu, 2021)"""
+    from demonstrated actions, in units of the action scale (Fujimoto and Gu, 2021, who also divide
+    the value in the loss by the mean of its magnitude; here it is not)"""
     gamma: flags.Share | Literal["auto"] = "auto"
     """discount factor (CleanRL: 0.99); `auto`: 0.95, and 0.98 for arms with a joint that turns all
     the way round, as an arm at its limit may have to"""
@@ -265,7 +269,8 @@ class HerReplayBuffer:
             self.arrays[name] = np.zeros(capacity, np.int32)
         self.latents = np.zeros((1, latent_size), np.float32)
         self.latent_numbers = {}
-        self.env = env.unwrapped
+        self.compute_reward = env.get_wrapper_attr("compute_reward")
+        self.compute_terminated = env.get_wrapper_attr("compute_terminated")
         self.capacity = capacity
         self.args = args
         self.rng = rng
@@ -332,8 +337,8 @@ class HerReplayBuffer:
         data["desired_goal"] = np.where(relabel[:, None], hindsight_goal, data["desired_goal"])
         achieved, desired = data["next_achieved_goal"], data["desired_goal"]
         info = {"collision": data["collision"][:, 0] > 0}
-        data["reward"] = self.env.compute_reward(achieved, desired, info).astype(np.float32)
-        data["terminated"] = self.env.compute_terminated(achieved, desired, info).astype(np.float32)
+        data["reward"] = self.compute_reward(achieved, desired, info).astype(np.float32)
+        data["terminated"] = self.compute_terminated(achieved, desired, info).astype(np.float32)
         for name in ("", "next_"):
             latent = self.latents[data.pop(f"{name}latent")]
             data[f"{name}observation"] = np.hstack([data[f"{name}observation"], latent])
@@ -373,7 +378,8 @@ def env_arguments(args):
 
 def make_env(args, demos=None) -> Any:
     """An environment; with demonstrations, its episodes are their queries."""
-    rules = {"horizon": args.horizon, "stop_on_collision": args.stop_on_collision}
+    rules = {name: getattr(args, name) for name in ("horizon", "stop_on_collision", "contact_cost")}
+    rules["goal_link_distances"] = False  # relabelled goals would not have them
     env = roboarm_nmp.make(args.task, **env_arguments(args), **rules)
     return env if demos is None else DemoQueriesWrapper(env, demos)
 
@@ -533,7 +539,7 @@ if __name__ == "__main__":
             demo_buffer.add_episode(demo_transitions(demo, env))
     observations, infos = envs.reset(seed=reset_seeds(args, run.step))
     demo_numbers: Any = infos.get("demo")
-    returns = np.zeros(args.num_envs)
+    returns, contacts = np.zeros(args.num_envs), np.zeros(args.num_envs)
     losses = {}
     logged = 0.0
     run.start(args.total_timesteps, "step")
@@ -561,7 +567,7 @@ if __name__ == "__main__":
                 os.replace(latest, run.folder / "policy.onnx")
             observations, infos = envs.reset(seed=reset_seeds(args, run.step))
             demo_numbers = infos.get("demo")
-            returns[:] = 0.0
+            returns[:] = contacts[:] = 0.0
         reached = args.stop_at_success is not None and progress["best"] >= args.stop_at_success
         if run.step >= args.total_timesteps or reached:
             break
@@ -589,6 +595,7 @@ if __name__ == "__main__":
                 array[i] = infos["final_obs"][i][name]
         buffer.add(observations, actions, reached_observations, collisions, ended)
         returns += rewards
+        contacts += collisions
         for i in np.flatnonzero(ended):
             success = infos["final_info"]["is_success"][i]
             if uses_demos and not success and rng.random() < args.demo_prob:
@@ -596,8 +603,9 @@ if __name__ == "__main__":
                 progress["demos_injected"] += 1
             steps = infos["final_info"]["elapsed_steps"][i]
             episode = {"episodic_return": returns[i], "episodic_length": steps, "success": success}
+            episode["contact_share"] = contacts[i] / steps
             run.log({f"charts/{name}": value for name, value in episode.items()})
-            returns[i] = 0.0
+            returns[i] = contacts[i] = 0.0
         if uses_demos and ended.any():
             demo_numbers = np.where(ended, infos["demo"], demo_numbers)
         observations = next_observations

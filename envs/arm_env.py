@@ -77,6 +77,11 @@ def _positive(most=math.inf, whole=False):
     return check
 
 
+def _check_cost(name, value):
+    if not (is_number(value) and 0 <= value < math.inf):
+        raise ValueError(f"{name} must be a finite number, at least 0, got {value!r}")
+
+
 def _check_image_size(name, value):
     is_pair = isinstance(value, (tuple, list, np.ndarray)) and np.shape(value) == (2,)
     if not is_pair or not all(isinstance(side, (int, np.integer)) for side in value):
@@ -91,6 +96,7 @@ _CHECKS = {
     "reward": _one_of("sparse", "dense"),
     "render_mode": _one_of(None, "rgb_array", "human"),
     "stop_on_collision": check_bool,
+    "contact_cost": _check_cost,
     "sink_state": check_bool,
     "velocities": check_bool,
     # m, and L2 in the normalised space. Hardly any start is farther from its goal than these, so a
@@ -150,6 +156,7 @@ class RoboArmEnv(gym.Env):
         reward: `sparse`, -1 per step and 0 on reaching the goal, or `dense`, minus the distance
             to the goal in the goal's own metric (metres for `ee` and `combined`). For `pose` that
             is the distance in metres, plus the angle times `ee_tolerance / angle_tolerance`.
+        contact_cost: taken off the reward of each step with a contact.
         sink_state: instead of terminating, stay where the episode ended, at reward 0 whatever the
             action, until the horizon.
         velocities: add joint velocities to `observation`.
@@ -182,6 +189,7 @@ class RoboArmEnv(gym.Env):
         horizon: int = HORIZON,
         stop_on_collision: bool = False,
         reward: Literal["sparse", "dense"] = "sparse",
+        contact_cost: float = 0.0,
         sink_state: bool = False,
         velocities: bool = False,
         render_mode: Literal["rgb_array", "human"] | None = None,
@@ -210,6 +218,7 @@ class RoboArmEnv(gym.Env):
         self.horizon = int(horizon)
         self.stop_on_collision = stop_on_collision
         self.reward = reward
+        self.contact_cost = float(contact_cost)
         self.sink_state = sink_state
         self.velocities = velocities
         self.render_mode = render_mode
@@ -537,14 +546,10 @@ class RoboArmEnv(gym.Env):
         self._read_arm()
 
         observation = self._observation()
-        distance, reached = self._goal_type.compare(
-            observation["achieved_goal"], self._desired_goal, self._tolerances
-        )
-        self._is_success = bool(reached)
+        goals = observation["achieved_goal"], self._desired_goal
+        self._is_success = bool(self._compare(*goals)[1])
         info = self._info(collision, self._is_success)
-        reward = 0.0 if self._is_success else -1.0
-        if self.reward == "dense":
-            reward = -float(distance)
+        reward = float(self.compute_reward(*goals, info))
         ended = self._is_success or (self.stop_on_collision and collision)
         self._in_sink = self.sink_state and ended
         terminated = ended and not self.sink_state
@@ -587,20 +592,19 @@ class RoboArmEnv(gym.Env):
         goals = np.asarray(achieved_goal), np.asarray(desired_goal)
         return self._goal_type.compare(*goals, self._tolerances)
 
-    def _reward(self, distance, reached):
-        if self.reward == "dense":
-            return -distance
-        reward = np.where(reached, 0.0, -1.0).astype(np.float32)
-        return reward[()]  # () makes a scalar of an array without dimensions
-
     def compute_reward(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
     ) -> np.ndarray:
         """Reward of arriving at `achieved_goal` (..., d) when the goal is `desired_goal` (..., d).
 
-        Returns an array of the batch shape, a NumPy scalar for single goals. `info` is not used.
+        Returns an array of the batch shape, a NumPy scalar for single goals. With `contact_cost`
+        the `collision` of `info` is read, as by `compute_terminated`. `step` calls this, too.
         """
-        return self._reward(*self._compare(achieved_goal, desired_goal))
+        distance, reached = self._compare(achieved_goal, desired_goal)
+        reward = -distance if self.reward == "dense" else reached.astype(np.float32) - np.float32(1)
+        if self.contact_cost > 0:
+            reward = reward - np.float32(self.contact_cost) * _entry(info, "collision", bool)
+        return reward
 
     def compute_terminated(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any

@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # they import PyTorch and Numba, which takes seconds
     from roboarm_nmp.envs.perception.geometry_source import GeometrySource
 
 
-class _ArmWrapper(gym.Wrapper):
+class ArmWrapper(gym.Wrapper):
     """An environment with additional observations, and all other attributes of the wrapped one.
 
     `_extend` maps an observation of the wrapped environment to one of this.
@@ -69,7 +69,7 @@ class _ArmWrapper(gym.Wrapper):
         return self._extend(observation), float(reward), terminated, truncated, info
 
 
-class SensorWrapper(_ArmWrapper):
+class SensorWrapper(ArmWrapper):
     """Adds `sensors` to the observation: a dict of a sensor's name -> its observation (a dict).
 
     Args:
@@ -185,7 +185,7 @@ def _spaces(env: Any) -> dict[str, Any]:
     return env.observation_space.spaces
 
 
-class ObservedSceneWrapper(_ArmWrapper):
+class ObservedSceneWrapper(ArmWrapper):
     """The scene as it is observed during an episode, which encoders and geometry sources receive.
 
     In a static scene, without noise and without `observe_every`, that is the scene itself, of which
@@ -264,7 +264,7 @@ def observed_scene(env: gym.Env) -> Scene:
         return env.get_wrapper_attr("current_scene")
 
 
-class SceneEncodingWrapper(_ArmWrapper):
+class SceneEncodingWrapper(ArmWrapper):
     """Appends z_E, the encoded scene, to `observation` (paper, section 5.1).
 
     A scene is encoded once; one with moving obstacles in each step, with the arm where it is. All
@@ -287,7 +287,7 @@ class SceneEncodingWrapper(_ArmWrapper):
         return {**observation, "observation": np.concatenate([observation["observation"], z])}
 
 
-class LinkDistancesWrapper(_ArmWrapper):
+class LinkDistancesWrapper(ArmWrapper):
     """Adds `link_distances` to the observation: the signed distance of each link, and its gradient.
 
     float32, the robot's `link_distances_shape`, a row per link that may collide: the distance from

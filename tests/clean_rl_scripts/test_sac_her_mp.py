@@ -138,15 +138,15 @@ def test_share_of_relabelled_goals():
     assert abs((goals != -5).mean() - 0.8) < 0.02
 
 
-def test_collisions_end_episodes_only_with_stop_on_collision():
-    for stop in (False, True):
-        env = envs.make("no_obstacles", stop_on_collision=stop)
+def test_collisions_end_episodes_only_with_stop_on_collision_and_cost_what_they_should():
+    for stop, cost in ((False, 0.0), (True, 0.5)):
+        env = envs.make("no_obstacles", stop_on_collision=stop, contact_cost=cost)
         buffer = make_buffer(env, 10, 0.0)
         buffer.add_episode(episode(3, 0, env))
         batch = buffer.sample(100)
         collided = batch["next_achieved_goal"][:, 0] == 1
         np.testing.assert_array_equal(batch["terminated"], collided if stop else 0 * collided)
-        np.testing.assert_array_equal(batch["reward"], -1)
+        np.testing.assert_array_equal(batch["reward"], -1 - cost * collided)
 
 
 def test_ring_overwrites_the_oldest_and_keeps_episodes_apart():

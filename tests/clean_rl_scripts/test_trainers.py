@@ -91,12 +91,13 @@ def test_run_writes_result_policy_and_tensorboard_events(finished_run, trainer):
     if trainer != "bc":
         losses = ["qf1_values", "qf_loss", "actor_loss"]
         assert {
-            f"charts/{tag}" for tag in ("episodic_return", "episodic_length", "success")
+            f"charts/{tag}"
+            for tag in ("episodic_return", "episodic_length", "success", "contact_share")
         } <= scalars
     for tag in losses:
         assert math.isfinite(events.Scalars(f"losses/{tag}")[0].value)
     assert events.Scalars("charts/SPS")[0].value > 0
-    for tag in ("success_rate", "collision_free_success_rate", "collision_rate"):
+    for tag in RESULTS[:-1]:  # but for the mean steps of successes
         assert [event.step for event in events.Scalars(f"eval/{tag}")] == [300, 600]
     gifs = {path.name for path in finished_run.glob("*.gif")}
     if trainer == "td3_her_mp":  # with --capture-video

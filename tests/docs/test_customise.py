@@ -10,12 +10,10 @@ from paths import ROOT
 from problem_files import write_folder
 from trainers import PATHS, load
 
-from roboarm_nmp import envs
 from roboarm_nmp.datasets.demonstrations import load_demos
 from roboarm_nmp.datasets.problems import load_problems
 from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.demo_generation import plan
-from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.scene_embedding_train import collect
 from roboarm_nmp.utils import flags
 
@@ -78,45 +76,39 @@ def test_encoder_of_the_page_encodes_scenes_with_unit_variance(tmp_path, monkeyp
     np.testing.assert_allclose(encoded.std(0), 1, atol=0.05)
 
 
-def test_reward_of_the_page_charges_contacts_in_steps_and_in_batches():
+def test_reward_of_the_page_is_that_of_steps_and_of_batches():
     names = {}
     exec(code_of("customise/reward.md")[0], names)
     env = names["env"]
-    transitions = []
-    for query in load_queries("double_walls", "validation")[:4]:
-        observation, _ = env.reset_specific(*query)
-        ended = False
-        while not ended:
-            action = PANDA.normalise(query.goal) - observation["observation"][:7]
-            observation, reward, *ends, info = env.step(action)
-            goals = observation["achieved_goal"], observation["desired_goal"]
-            transitions.append((*goals, reward, info))
-            ended = any(ends)
-    achieved, desired, rewards, infos = zip(*transitions, strict=True)
-    collision = np.array([info["collision"] for info in infos])
-    success = np.array([info["is_success"] for info in infos])
-    assert 0 < collision.sum() < len(collision)
-    expected = np.where(success, 0.0, -1.0) - 0.5 * collision
-    np.testing.assert_array_equal(rewards, expected)
-    for info in (infos, {"collision": collision}):
-        batch = env.compute_reward(np.array(achieved), np.array(desired), info)
-        np.testing.assert_array_equal(batch, expected)
+    observation, _ = env.reset_specific(*load_queries("double_walls", "validation")[0])
+    achieved, desired, rewards = [], [], []
+    for _ in range(5):
+        observation, reward, *_ = env.step(env.action_space.sample())
+        achieved.append(observation["achieved_goal"])
+        desired.append(observation["desired_goal"])
+        rewards.append(reward)
+    distance = np.linalg.norm(np.subtract(achieved, desired), axis=1)
+    np.testing.assert_allclose(rewards, -1 - 2 * distance, rtol=1e-6)
+    batch = env.compute_reward(np.array(achieved), np.array(desired), {})
+    np.testing.assert_array_equal(batch, rewards)
 
 
-def test_changed_replay_buffer_charges_contacts(tmp_path, monkeypatch):
-    _, before, after = code_of("customise/reward.md")
+def test_replay_buffer_honours_the_reward_of_a_wrapper(tmp_path, monkeypatch):
+    _, wrapper, before, after = code_of("customise/reward.md")
+    names = {"np": np}
+    exec(wrapper, names)
     sources = [PATHS[name].read_text() for name in ("sac_her_mp", "td3_her_mp")]
     assert all(source.count(before) == 1 for source in sources)
     script = tmp_path / "changed.py"
     script.write_text(sources[0].replace(before, after))
     monkeypatch.setitem(PATHS, "changed", script)
-    env = envs.make("no_obstacles")
     changed = load("changed")
+    changed.DistanceCost = names["DistanceCost"]
     args = changed.Args(her_probability=0.0)
+    env = changed.make_env(args)
     buffer = changed.HerReplayBuffer(env, 100, args, np.random.default_rng(0))
     step = {name: np.zeros(10) for name in ("observation", "next_observation")}
-    step |= {"action": np.zeros(7), "next_achieved_goal": np.zeros(3)}
-    step["desired_goal"] = np.ones(3)
-    buffer.add_episode([step | {"collision": number < 3} for number in range(10)])
-    assert set(buffer.sample(200)["reward"].tolist()) == {-1.0, -1.5}
+    step |= {"action": np.zeros(7), "desired_goal": np.zeros(3), "collision": False}
+    buffer.add_episode([step | {"next_achieved_goal": [0.5 * k, 0, 0]} for k in range(3)])
+    assert set(buffer.sample(200)["reward"].tolist()) == {0.0, -2.0, -3.0}
     env.close()

@@ -529,6 +529,7 @@ def test_position_goals_are_for_goal_type_ee():
         ({"goal_type": "poses"}, "goal_type must be one of 'ee', 'config', 'combined', 'pose'"),
         ({"max_step": -1}, "max_step must be a positive number"),
         ({"ee_tolerance": 3.0}, "ee_tolerance must be at most 1.0"),  # it would never reset
+        ({"contact_cost": -1}, "contact_cost must be a finite number, at least 0"),
         ({"episodes_per_scene": 1.5}, "episodes_per_scene must be a whole number"),
         ({"render_size": (70_000, 70_000)}, "render_size must be from 1 to 4096"),
     ],

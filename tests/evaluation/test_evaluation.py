@@ -111,20 +111,25 @@ def test_metrics_of_an_evaluation_equal_those_of_its_episodes(queries):
     env, rows = envs.make("no_obstacles"), []
     for start, goal in zip(queries.start, queries.goal, strict=True):
         observation, info = env.reset_specific(start, goal)
-        path, ended = [start.astype(float)], False
+        path, ended, contacts = [start.astype(float)], False, 0
         while not ended:
             action = PANDA.normalise(goal) - observation["observation"][:7]
             observation, _, terminated, truncated, info = env.step(action)
             path.append(PANDA.denormalise(observation["observation"][:7]))
+            contacts += info["collision"]
             ended = terminated or truncated
         length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
-        rows.append((info["is_success"], info["collision_so_far"], len(path) - 1, length))
+        touched = info["collision_so_far"]
+        rows.append((info["is_success"], touched, contacts, len(path) - 1, length))
     env.close()
-    success, collides, steps, lengths = (np.array(column) for column in zip(*rows, strict=True))
+    success, collides, contacts, steps, lengths = (
+        np.array(column) for column in zip(*rows, strict=True)
+    )
     assert result["num_queries"] == 40
     assert result["success_rate"] == success.mean() > 0.9
     assert result["collision_free_success_rate"] == (success & ~collides).mean()
     assert result["collision_rate"] == collides.mean()
+    assert result["contact_share"] == contacts.sum() / steps.sum() > 0
     assert 0 < result["collision_free_success_rate"] < result["success_rate"]
     assert result["mean_steps"] == pytest.approx(steps[success].mean())
     assert result["path_length"] == pytest.approx(lengths[success].mean(), abs=1e-5)

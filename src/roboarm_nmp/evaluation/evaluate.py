@@ -181,7 +181,7 @@ def evaluate(
         is what a policy lacks.
 
         - `success_rate`, `collision_free_success_rate`, `collision_rate`, each with its 95% Wilson
-          interval, `..._interval`;
+          interval, `..._interval`; `contact_share`: the share of all steps with a contact;
         - `mean_steps`, `path_length` (rad), `smoothness` (rad per step^2): means over successes;
         - `ee_path_length` (m), `ee_rotation` (degrees), `duration` (s), `mean_jerk` and `max_jerk`
           (rad/s^3), `sparc`, `ee_sparc`, and with `measure_clearance` `min_clearance` (m): means
@@ -571,6 +571,8 @@ class _Worker:
             "planning_seconds": planning_seconds,
             "plan_found": plan_found,
             "searched": searched,
+            "steps": len(trajectory),
+            "contacts": int(trajectory.contacts.sum()),
         }
         if self._observes_once and query.scene.is_static:
             # Here, because Numba takes a while to import.
@@ -679,6 +681,8 @@ def _summary(job: _Job, outcomes: list[Outcome]) -> dict[str, Any]:
     if job.problems:
         result["problems"] = job.problems
     result |= rates_and_means(outcomes)
+    steps = sum(outcome["steps"] for outcome in outcomes)
+    result["contact_share"] = sum(outcome["contacts"] for outcome in outcomes) / max(1, steps)
     reached = [outcome for outcome in outcomes if outcome["success"]]
     clearance = _mean(reached, "min_clearance") if options.measure_clearance else None
     result["min_clearance"] = clearance

@@ -11,7 +11,10 @@ from roboarm_nmp.envs.tasks import get_task
 from roboarm_nmp.training.arguments import fail
 from roboarm_nmp.training.runs import Run
 
-RESULTS = ("success_rate", "collision_free_success_rate", "collision_rate", "mean_steps")
+RESULTS = (
+    *("success_rate", "collision_free_success_rate", "collision_rate"),
+    *("contact_share", "mean_steps"),
+)
 """What a trainer reports of `evaluation.evaluate`."""
 
 
