@@ -31,6 +31,8 @@ QUERY = 2  # its start and goal lie on two sides of the walls
 ROWS, COLUMNS = 2, 3  # of scenes that vary
 GALLERY_COLUMNS, LABEL = 5, 22  # of all tasks; height (pixels) of names
 NUM_DEMOS = 24
+# Directions of view, (yaw, pitch) in degrees: from the front, the width of the gap is seen.
+CAMERAS = dict.fromkeys(("double_walls", "double_walls_wide_gap"), (90, -20))
 FAMILY_SEEDS = {}  # of figures of families of wide scenes, where the first one shows little
 COLOURS = ((0.85, 0.30, 0.25), (0.20, 0.45, 0.80), (0.95, 0.65, 0.15), (0.25, 0.60, 0.35))
 FOLDER = Path(__file__).parent / "figures"
@@ -108,7 +110,7 @@ def main():
             env.close()
             continue
         query = load_queries(task)[QUERY]
-        pixels = render_query(env, query, SIZE)
+        pixels = render_query(env, query, SIZE, camera=CAMERAS.get(task))
         save(pixels, f"{task}.png")
         gallery[task] = pixels[::2, ::2]
         if demo_path(task).exists():
