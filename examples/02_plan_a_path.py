@@ -1,6 +1,6 @@
 """Plan a path, check it, and export it with times, for a robot or for `roboarm show`.
 
-    python examples/plan_check_export.py --task double_walls --query 0 --output path.csv
+    python examples/02_plan_a_path.py --task double_walls --query 0 --output path.csv
     roboarm show double_walls --trajectory path.csv --output path.gif
 
 Prints the number of waypoints, whether the path is free and how near it comes to an obstacle, and

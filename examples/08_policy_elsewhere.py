@@ -1,7 +1,7 @@
 """One step of a pretrained policy with ONNX Runtime alone, without roboarm_nmp.
 
 roboarm policies bc-config-double_walls-s1 --export policy.onnx
-python examples/run_with_onnx_runtime.py policy.onnx
+python examples/08_policy_elsewhere.py policy.onnx
 """
 
 import json

@@ -7,11 +7,12 @@ import sys
 import numpy as np
 import pytest
 from paths import ROOT
-from trainers import run_here
+from trainers import TINIER, run_here, succeeds_here
 
 import roboarm_nmp
 from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.evaluation import benchmark
 from roboarm_nmp.motions.trajectories import load_joint_path
 from roboarm_nmp.policies import __main__ as policies
 from roboarm_nmp.policies.registry import make_policy
@@ -30,17 +31,39 @@ def run(tmp_path, monkeypatch, capsys):
     return run_example
 
 
-def test_demonstrations_train_a_network_of_ones_own(run):
-    few = ["--demos", 60, "--epochs", 3, "--queries", 3]
-    output = run("own_pytorch_loop.py", *few)
-    losses = [float(loss) for loss in re.findall(r"epoch \d: loss (\S+)", output)]
-    assert len(losses) == 3 and losses[2] < 0.9 * losses[0]
-    assert re.search(r"success \d\.\d\d of 3 validation queries", output)
+@pytest.mark.parametrize(
+    "example, arguments, printed",
+    [
+        ("01_step_an_environment.py", "--query 2", r"goal (not )?reached in \d+ steps, with"),
+        ("03_own_scene.py", "--queries 3", r"planner: success 1.00, without contact 1.00"),
+        ("04_own_robot.py", "", r"iiwa: 7 joints(.|\n)*goal reached in \d+ steps, without contact"),
+        (
+            "06_own_demonstrations.py",
+            "--motions 20 --epochs 2 --queries 2",
+            r"teleop.h5: (1\d|20) demonstrations(.|\n)*epoch 2: loss \S+\nsuccess",
+        ),
+        ("07_own_algorithm.py", TINIER, r"2 test queries: success"),
+        (
+            "09_moving_obstacles.py",
+            "",
+            r"after 1 s(.|\n)*y = 0.20 m(.|\n)*replanning: goal",
+        ),
+    ],
+)
+def test_example_prints_what_it_did(run, example, arguments, printed):
+    assert re.search(printed, run(example, *arguments.split()))
+
+
+def test_entry_of_the_example_is_verified(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["--task", "wall", "--num-queries", "2"]
+    succeeds_here(ROOT / "examples" / "10_benchmark_entry.py", *arguments)
+    assert benchmark.main(["verify", "entry"]) == 0
 
 
 def test_planned_path_is_checked_exported_and_can_be_shown(run, tmp_path, capsys, monkeypatch):
     file = "path.npz"
-    output = run("plan_check_export.py", "--query", 2, "--output", file)
+    output = run("02_plan_a_path.py", "--query", 2, "--output", file)
     free, motions = re.search(r"(\d+) of (\d+) motions are free", output).groups()
     assert free == motions and "goal reached" in output and "collision-free" in output
     times, configurations = load_joint_path(tmp_path / file, PANDA)
@@ -54,12 +77,12 @@ def test_planned_path_is_checked_exported_and_can_be_shown(run, tmp_path, capsys
 
 
 def test_own_points_lead_to_actions_that_avoid_them(run, tmp_path):
-    output = run("point_cloud_to_action.py")
+    output = run("05_own_point_cloud.py")
     assert "the straight motion to the goal is blocked" in output and "goal reached" in output
     assert float(re.search(r"smallest distance from a point: (\S+) mm", output)[1]) > 0
     # Points of one's own, far from the arm.
     np.save(tmp_path / "cloud.npy", np.full((10, 3), 3.0))
-    output = run("point_cloud_to_action.py", "--points", "cloud.npy")
+    output = run("05_own_point_cloud.py", "--points", "cloud.npy")
     assert "0 points; the straight motion to the goal is free" in output  # out of reach
 
 
@@ -82,7 +105,7 @@ def test_policy_runs_with_onnx_runtime_alone(tmp_path, capsys):
     name, file = "bc-config-double_walls-s1", tmp_path / "policy.onnx"
     assert policies.main([name, "--export", str(file)]) == 0
     table = capsys.readouterr().out
-    script = ROOT / "examples" / "run_with_onnx_runtime.py"
+    script = ROOT / "examples" / "08_policy_elsewhere.py"
     code = BLOCKED + script.read_text()
     process = subprocess.run(
         [sys.executable, "-c", code, file], capture_output=True, text=True, check=True, cwd=tmp_path
