@@ -29,6 +29,7 @@ def planner() -> Planner:
 
 def begin(problem: Problem) -> np.ndarray | None:
     """A path (k, 7), rad, which is then followed; None to give up."""
+    assert problem.points is not None  # --observes point_cloud
     scene = ObservedScene(robot=problem.robot, points=problem.points)
     start, goal = problem.start.astype(np.float32), problem.goal.astype(np.float32)
     try:

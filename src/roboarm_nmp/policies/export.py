@@ -1,4 +1,4 @@
-"""Saving a policy of one's own, as a file that `roboarm evaluate` runs without its script.
+"""Save your own policy as a file that `roboarm evaluate` runs without its script.
 
     save_policy("policy.onnx", module, "wall", goal_type="ee")
 

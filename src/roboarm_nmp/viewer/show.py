@@ -87,9 +87,9 @@ class Args(CloudFlags):
     front, 180 from its left; pitch -90 looks straight down, 0 horizontally. By default from a
     corner from which obstacles do not hide the arm."""
     trajectory: Path | None = None
-    """Play this file (.csv, .npz, .json, .yaml) instead of a policy's episode: one of `roboarm
-    retime`, of --save-trajectory, or of one's own. A .csv needs columns `q1` to `q7` (rad; as many
-    as joints), and may have `time` (s); a .npz an array `configurations` (k, n), and perhaps
+    """Play this file (.csv, .npz, .json, .yaml) instead of a policy's episode: a file of
+    `roboarm retime`, of --save-trajectory, or your own. A .csv needs columns `q1` to `q7` (rad; as
+    many as joints), and may have `time` (s); a .npz an array `configurations` (k, n), and perhaps
     `times`; a .yaml is ROS's trajectory_msgs/JointTrajectory. The arm is moved without physics, in
     the scene of --query; the ghost is the end."""
     save_trajectory: Path | None = None
