@@ -11,7 +11,9 @@ import json
 import baselines
 import paper_tables
 import unseen_obstacles
-from markdown_tables import NOTHING, csv_tables, interval, share, table, write
+from markdown_tables import NOTHING, ROOT, csv_tables, interval, share, table, write
+
+from roboarm_nmp.evaluation.leaderboard import leaderboard
 
 HARD = "random_boxes_hard"
 FIXED = ("wall", "double_walls")
@@ -76,6 +78,7 @@ def all_tables():
         **paper_tables.tables(paper_tables.read_cells(), results, references),
         **baselines.tables(others, unseen),
         **unseen_obstacles.tables(unseen, unseen_obstacles.others_results(others)),
+        "leaderboard": leaderboard(ROOT / "benchmarks" / "leaderboard"),
         **csv_tables(),
     }
 

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import yaml
 from paths import ROOT
+from problem_files import write_folder
 
+from roboarm_nmp.datasets.problems import load_problems, write_problems
 from roboarm_nmp.evaluation import benchmark
 from roboarm_nmp.evaluation.entrants import EntrantError, FunctionMethod, ProgramMethod
 from roboarm_nmp.evaluation.evaluate import EvaluationError, evaluate
@@ -60,7 +62,48 @@ def test_entry_is_verified_and_its_numbers_are_those_of_an_evaluation(entry, tmp
     assert length == pytest.approx(expected["path_length"], rel=0.02)
     assert benchmark.main(["table", str(rows)]) == 0
     table = capsys.readouterr().out
-    assert "### `chased_goals`" in table and "| go-to-goal | " in table
+    assert "### `chased_goals`\n" in table and "| go-to-goal | " in table
+    task = row["tasks"]["double_walls"]
+    assert f"6, `{task['queries_digest'][:8]}` | `{task['sha256'][:8]}` |" in table
+
+
+def test_goal_poses_are_judged_by_the_criterion_of_motion_policy_networks(tmp_path, capsys):
+    flags = ["--policy", "planner", "--pose-goals", "--num-queries", "4", "--workers", "1"]
+    entry = str(tmp_path / "entry")
+    assert benchmark.main(["run", *flags, "--tasks", "double_walls", "--output", entry]) == 0
+    row = tmp_path / "row.yaml"
+    assert benchmark.main(["verify", entry, "--workers", "1", "--row", str(row)]) == 0
+    strict = yaml.safe_load(row.read_text())["tasks"]["double_walls"]["mean_steps"]
+    rough = evaluate("planner", "double_walls", goal_type="pose", num_queries=4)
+    assert 0 <= strict - rough["mean_steps"] <= 2  # it ends nearer to the goal
+    capsys.readouterr()
+    assert benchmark.main(["table", str(tmp_path)]) == 0
+    table = capsys.readouterr().out
+    assert "### `double_walls`, goals are poses" in table and "Networks' criterion |" in table
+
+
+def test_sets_of_problems_are_entered_from_their_files(tmp_path, capsys):
+    imported = tmp_path / "box_panda.h5"
+    write_problems(imported, load_problems(write_folder(tmp_path / "box_panda")))
+    entry, problems = str(tmp_path / "entry"), ["--problems", str(tmp_path), "--workers", "1"]
+    run = ["run", "--policy", "planner", "--tasks", "box_panda", "--output", entry]
+    assert benchmark.main(run) == 1
+    assert "box_panda: needs MotionBenchMaker's problems" in capsys.readouterr().err
+    assert benchmark.main([*run, *problems]) == 0
+    assert benchmark.main(["verify", entry, *problems]) == 0
+    output = capsys.readouterr().out
+    assert "success 1.000, collision-free 1.000" in output and "1 episodes replayed" in output
+
+
+def test_policies_flags_change_the_class_of_an_entry(capsys):
+    def described(*flags):
+        options = benchmark._parser().parse_args(["run", "--output", "entry", *flags])
+        return benchmark._method(options)[2:]
+
+    filtered = ["--policy", "go-to-goal", "--safety-margin", "0.01"]
+    assert described("--policy", "go-to-goal") == ("nothing", False, False)
+    assert described(*filtered) == ("ground truth", False, True)
+    assert described(*filtered, "--observes", "point_cloud") == ("point cloud", False, False)
 
 
 def test_interrupted_run_continues_and_another_method_is_refused(entry, capsys):

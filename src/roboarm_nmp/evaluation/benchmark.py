@@ -24,19 +24,20 @@ from roboarm_nmp.evaluation.entrants import FunctionMethod, ProgramMethod
 from roboarm_nmp.evaluation.evaluate import EvaluationError
 from roboarm_nmp.evaluation.leaderboard import leaderboard
 from roboarm_nmp.evaluation.submissions import (
+    PROBLEM_SETS,
     TRACKS,
     SubmissionError,
     verify_submission,
     write_submission,
 )
-from roboarm_nmp.policies.baselines import CHECKING, PLANNERS
+from roboarm_nmp.policies.baselines import CHECKING, PLANNERS, REPLANNING
 from roboarm_nmp.policies.policy import Method
 from roboarm_nmp.utils.files import write_atomically
 from roboarm_nmp.utils.flags import CORES
 from roboarm_nmp.utils.names import suggest
 from roboarm_nmp.utils.signals import end_with_one_line, error_line
 
-ALL_TASKS = [task for tasks in TRACKS.values() for task in tasks]
+ALL_TASKS = [task for tasks in TRACKS.values() for task in tasks if tasks != PROBLEM_SETS]
 QUICK = 50  # queries of each task
 
 
@@ -57,6 +58,11 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = parser.add_subparsers(dest="command", required=True)
+    problems = {
+        "type": Path,
+        "metavar": "FOLDER",
+        "help": "MotionBenchMaker's sets: a file SET.h5 of `roboarm import` for each",
+    }
     workers = {"type": int, "default": CORES, "metavar": "N", "help": "processes"}
 
     run = commands.add_parser("run", help="run a method on the benchmark and write its submission")
@@ -66,8 +72,13 @@ def _parser() -> argparse.ArgumentParser:
     method.add_argument("--program", metavar="COMMAND", help="a program that speaks JSON lines")
     run.add_argument("--output", type=Path, required=True, help="folder of the submission")
     run.add_argument(
-        "--tasks", nargs="+", default=ALL_TASKS, metavar="TASK", help="by default all of the tracks"
+        "--tasks",
+        nargs="+",
+        default=ALL_TASKS,
+        metavar="TASK",
+        help="by default all tracks but MotionBenchMaker's",
     )
+    run.add_argument("--problems", **problems)
     run.add_argument("--num-queries", type=int, default=1000, help="test queries of each task")
     run.add_argument("--quick", action="store_true", help=f"{QUICK} queries of each task")
     run.add_argument("--workers", **workers)
@@ -79,6 +90,17 @@ def _parser() -> argparse.ArgumentParser:
         "policy; by default nothing, or the policy's own",
     )
     run.add_argument("--searches", action="store_true", help="the method searches for paths")
+    run.add_argument(
+        "--safety-margin", type=float, metavar="M",
+        help="put a safety filter with this margin (m) around the policy, e.g. 0.01; 0 for none",
+    )  # fmt: skip
+    run.add_argument(
+        "--search", action="store_true", help="of a policy that draws paths: else search for one"
+    )
+    run.add_argument(
+        "--pose-goals", action="store_true",
+        help="goals are poses of the end effector, reached at 1 cm and 15 degrees",
+    )  # fmt: skip
     about = run.add_argument_group("about the method, for the table")
     about.add_argument("--name", help="by default that of the policy, function or program")
     about.add_argument("--authors", default="", help="names")
@@ -96,6 +118,7 @@ def _parser() -> argparse.ArgumentParser:
         "verify", help="replay all episodes of submissions and compare with what they claim"
     )
     verify.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
+    verify.add_argument("--problems", **problems)
     verify.add_argument("--workers", **workers)
     verify.add_argument(
         "--row", type=Path, metavar="FILE", help="write the verified row of the table here (.yaml)"
@@ -108,8 +131,9 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(options: argparse.Namespace) -> int:
     for task in options.tasks:
-        if task not in TASKS:
-            raise SubmissionError(f"no such task: {task}: {suggest(task, TASKS)}")
+        known = (*TASKS, *PROBLEM_SETS)
+        if task not in known:
+            raise SubmissionError(f"no such task: {task}: {suggest(task, known)}")
     policy, arguments, observes, searches, privileged = _method(options)
     description = {
         "method": options.name or str(policy),
@@ -131,6 +155,7 @@ def _run(options: argparse.Namespace) -> int:
         options.tasks,
         QUICK if options.quick else options.num_queries,
         progress=True,
+        problems=options.problems,
         workers=options.workers,
         seed=options.seed,
         **arguments,
@@ -146,8 +171,11 @@ def _method(options) -> tuple[str | Method, dict[str, Any], str, bool, bool]:
     """The policy, arguments of `evaluate`, what it observes, whether it searches, privileged."""
     from roboarm_nmp.evaluation.evaluate import is_privileged
     from roboarm_nmp.policies.registry import find_policy, own_safety_filter
+    from roboarm_nmp.policies.safety_filter import SafetyFilter
 
     if options.policy is None:
+        if options.safety_margin is not None or options.search or options.pose_goals:
+            raise EvaluationError("--safety-margin, --search and --pose-goals are for policies")
         observes = options.observes or "nothing"
         if options.function:
             method = FunctionMethod(options.function, observes)
@@ -159,20 +187,29 @@ def _method(options) -> tuple[str | Method, dict[str, Any], str, bool, bool]:
         policy, trained = find_policy(options.policy)
     except ValueError as error:
         raise EvaluationError(f"--policy: {error}") from error
+    arguments: dict[str, Any] = {}
+    if options.observes:
+        arguments["geometry_source"] = options.observes
+    if options.safety_margin is not None:
+        margin = options.safety_margin
+        arguments["safety_filter"] = SafetyFilter(margin) if margin else False
+    if options.pose_goals:
+        arguments["goal_type"] = "pose"
+    if options.search:
+        arguments["search"] = True
+    has_filter = arguments.get("safety_filter", own_safety_filter(policy))
     source = options.observes or trained.get("geometry_source")
-    if source is None and (policy in CHECKING or own_safety_filter(policy)):
+    if source is None and (policy in CHECKING or has_filter):
         source = "ground_truth"
     encoder = trained.get("encoder")
-    privileged = is_privileged(trained) or (policy in CHECKING and source == "ground_truth")
-    if privileged:
+    if source == "ground_truth" or is_privileged(trained):
         observes = "ground truth"
     elif "point_cloud" in (source, encoder):
         observes = "point cloud"
     else:
         observes = "latent code" if encoder else "nothing"
-    arguments = {"geometry_source": options.observes} if options.observes else {}
-    searches = options.searches or policy in PLANNERS or policy == "replanning"
-    return options.policy, arguments, observes, searches, privileged
+    searches = options.searches or options.search or policy in PLANNERS or policy == REPLANNING
+    return options.policy, arguments, observes, searches, observes == "ground truth"
 
 
 def _processor() -> str:
@@ -190,7 +227,9 @@ def _verify(options: argparse.Namespace) -> int:
     code = 0
     for folder in options.folders:
         try:
-            row = verify_submission(folder, options.workers, progress=True)
+            row = verify_submission(
+                folder, options.workers, progress=True, problems=options.problems
+            )
         except SubmissionError as error:
             print(error_line(error), file=sys.stderr)
             code = 1

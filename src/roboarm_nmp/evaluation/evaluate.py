@@ -25,7 +25,7 @@ import numpy as np
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.format import QueryScenes, SeededScenes
 from roboarm_nmp.datasets.problem_formats import Problem
-from roboarm_nmp.datasets.problems import load_problems
+from roboarm_nmp.datasets.problems import Problems, load_problems
 from roboarm_nmp.datasets.queries import Query, load_queries, validate
 from roboarm_nmp.envs.arm_env import Observation, RoboArmEnv, deviations
 from roboarm_nmp.envs.goals import GOAL_TYPES, GoalTypeName
@@ -34,6 +34,8 @@ from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH
 from roboarm_nmp.envs.perception.noise import SensorNoise
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
+from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.tasks import get_task, task_name
 from roboarm_nmp.evaluation.rollout import REAL_TIME, render_steps, rollout
@@ -112,8 +114,8 @@ class EvaluationOptions:
             obstacles.
         workers: processes, >= 1. More than one needs the caller's script to be importable
             (`if __name__ == "__main__":`), as always with `multiprocessing`.
-        env: dict with `action_mode`, `max_step`, `velocities` where a function needs other than the
-            defaults. A policy network brings its own.
+        env: dict of arguments of `envs.make`, such as `action_mode`, where they are other than the
+            defaults. Those that a policy network was trained with go before.
 
     Raises:
         EvaluationError: a number is out of its range.
@@ -370,7 +372,7 @@ def _make_job(
                     f"{policy} was trained with the goal type {trained_with!r}, it cannot be "
                     f"evaluated with {options.goal_type!r}: leave out --goal-type"
                 )
-        options = replace(options, env=trained or options.env)
+        options = replace(options, env=options.env | trained)
     problems = None
     if options.problems is not None:
         if task is None:
@@ -396,15 +398,23 @@ def _with_problems(task, options):
         raise EvaluationError("queries and problems: give one of them")
     if options.split != "test":
         raise EvaluationError(f"split {options.split!r}: problems have no splits")
-    problems = load_problems(options.problems, get_task(task).base_scene.robot)
+    problems = problem_queries(options.problems, get_task(task).base_scene.robot)
+    options = replace(options, queries=problems)
+    return options, {"file": Path(options.problems).name, "sha256": problems.digest}
+
+
+def problem_queries(path: str | Path, robot: Robot = PANDA) -> Problems:
+    """Problems with one goal configuration each, as `evaluate` takes them.
+
+    Raises EvaluationError: some cannot be used.
+    """
+    problems = load_problems(path, robot)
     if problems.rejected:
         raise EvaluationError(
             f"{len(problems.rejected)} problems cannot be used: {problems.rejected[0].reason}; "
             f"`roboarm import` writes a file of the others"
         )
-    with_one_goal = tuple(_with_one_goal(problem) for problem in problems.all)
-    options = replace(options, queries=replace(problems, all=with_one_goal))
-    return options, {"file": Path(options.problems).name, "sha256": problems.digest}
+    return replace(problems, all=tuple(_with_one_goal(problem) for problem in problems.all))
 
 
 def _with_one_goal(problem: Problem) -> Problem:

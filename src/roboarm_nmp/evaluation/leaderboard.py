@@ -7,9 +7,12 @@ from roboarm_nmp.evaluation.submissions import TRACKS, SubmissionError
 from roboarm_nmp.utils.documents import DocumentError, load_document, plain_data
 
 COLUMNS = (
-    *("method", "success", "95 % interval", "collision-free", "path (rad)", "duration (s)"),
-    *("jerk (rad/s³)", "s per query", "training seeds", "queries"),
+    *("method", "success", "95 % interval", "collision-free success", "95 % interval"),
+    *("path (rad)", "duration (s)", "jerk (rad/s³)", "s per query", "training seeds"),
+    *("queries, version", "actions"),
 )
+CRITERION = "Motion Policy Networks' criterion"
+"""What collision-free success is called where goals are poses, with `POSE_TOLERANCES`."""
 CLASSES = (
     ("ground truth", False),
     ("ground truth", True),
@@ -24,7 +27,7 @@ CLASSES = (
 
 
 def leaderboard(folder: str | Path) -> str:
-    """Tables of all rows (`*.yaml`) of a folder, one per task and class, the best method first.
+    """Tables of the rows (`*.yaml`) in a folder, per task and type of goal, best first.
 
     Raises SubmissionError: there is no row, or one is damaged.
     """
@@ -33,12 +36,21 @@ def leaderboard(folder: str | Path) -> str:
         raise SubmissionError(f"{folder}: no rows; `roboarm benchmark verify --row` writes them")
     parts = []
     for track, tasks in TRACKS.items():
-        parts.append(f"## {track.capitalize()}\n")
+        tables = []
         for task in tasks:
-            table = _table(task, [row for row in rows if task in row["tasks"]])
-            if table:
-                parts.append(f"### `{task}`\n\n{table}\n")
+            entered = [row for row in rows if task in row["tasks"]]
+            for has_poses in (False, True):
+                suitable = [row for row in entered if _has_pose_goals(row, task) == has_poses]
+                if suitable:
+                    goals = ", goals are poses" if has_poses else ""
+                    tables.append(f"### `{task}`{goals}\n\n{_table(task, suitable, has_poses)}\n")
+        if tables:
+            parts += [f"## {track[0].upper()}{track[1:]}\n", *tables]
     return "\n".join(parts).rstrip() + "\n"
+
+
+def _has_pose_goals(row: dict[str, Any], task: str) -> bool:
+    return row["tasks"][task].get("goal_type") == "pose"
 
 
 def _read_row(path: Path) -> dict[str, Any]:
@@ -51,8 +63,11 @@ def _read_row(path: Path) -> dict[str, Any]:
     return row
 
 
-def _table(task: str, rows: list[dict[str, Any]]) -> str:
-    lines = []
+def _table(task: str, rows: list[dict[str, Any]], has_poses: bool) -> str:
+    columns = [*COLUMNS]
+    if has_poses:
+        columns[3] = CRITERION
+    lines = ["| " + " | ".join(columns) + " |", "|" + " --- |" * len(columns)]
     for observes, searches in CLASSES:
         group = [row for row in rows if (row["observes"], row["searches"]) == (observes, searches)]
         group.sort(key=lambda row: -row["tasks"][task]["success_rate"])
@@ -60,28 +75,25 @@ def _table(task: str, rows: list[dict[str, Any]]) -> str:
             search = "searches" if searches else "no search"
             privileged = ", privileged" if observes == "ground truth" else ""
             title = f"**observes {observes}{privileged}; {search}**"
-            lines.append(f"| {title} |" + " |" * (len(COLUMNS) - 1))
+            lines.append(f"| {title} |" + " |" * (len(columns) - 1))
             lines += [_line(row, row["tasks"][task], task) for row in group]
-    if not lines:
-        return ""
-    header = ["| " + " | ".join(COLUMNS) + " |", "|" + " --- |" * len(COLUMNS)]
-    return "\n".join(header + lines)
+    return "\n".join(lines)
 
 
 def _line(row: dict[str, Any], numbers: dict[str, Any], task: str) -> str:
     method = f"[{row['method']}]({row['link']})" if row.get("link") else row["method"]
     if task in row.get("developed_on", []):
         method += " †"
-    low, high = numbers["success_rate_interval"]
-    cells = [
-        method,
-        f"{numbers['success_rate']:.3f}",
-        f"{low:.3f} to {high:.3f}",
-        f"{numbers['collision_free_success_rate']:.3f}",
-        *(_number(numbers[name]) for name in ("path_length", "duration", "mean_jerk")),
+    cells = [method]
+    for name in ("success_rate", "collision_free_success_rate"):
+        low, high = numbers[f"{name}_interval"]
+        cells += [f"{numbers[name]:.3f}", f"{low:.3f} to {high:.3f}"]
+    cells += [_number(numbers[name]) for name in ("path_length", "duration", "mean_jerk")]
+    cells += [
         _number(numbers["seconds_per_query"]),
         str(row["training_seeds"]) if row["training_data"] != "none" else "–",
-        f"{numbers['num_queries']:,}",
+        f"{numbers['num_queries']:,}, `{numbers['queries_digest'][:8]}`",
+        f"`{numbers['sha256'][:8]}`",
     ]
     return "| " + " | ".join(cells) + " |"
 

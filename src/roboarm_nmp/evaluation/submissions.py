@@ -10,6 +10,7 @@ actions and compares. docs/reference/file_formats.md describes the files.
 
 import functools
 import hashlib
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,12 +31,15 @@ from roboarm_nmp.datasets.format import (
     open_hdf5,
     read_attributes,
 )
-from roboarm_nmp.datasets.queries import Queries, load_queries
+from roboarm_nmp.datasets.problems import Problems
+from roboarm_nmp.datasets.queries import Queries, Query, load_queries
 from roboarm_nmp.envs.goals import GOAL_TYPES
 from roboarm_nmp.evaluation.evaluate import (
+    EvaluationError,
     Outcome,
     RecordedEpisode,
     episode_outcome,
+    problem_queries,
     rates_and_means,
     record,
     trajectory_digest,
@@ -51,8 +55,12 @@ TRACKS = {
     "fixed goals": ("double_walls", "boxes"),
     "unseen obstacles": ("random_boxes_hard", "three_shelves", "narrow_shelves"),
     "moving obstacles": ("moving_boxes_medium", "chased_goals"),
+    "MotionBenchMaker": (
+        *("bookshelf_tall_panda", "bookshelf_thin_panda", "box_panda", "table_pick_panda"),
+    ),
 }
-"""The benchmark's tasks."""
+"""The benchmark's tasks. MotionBenchMaker's are sets of problems, which users have to fetch."""
+PROBLEM_SETS = TRACKS["MotionBenchMaker"]
 SCHEMA, VERSION = "roboarm-nmp benchmark actions", 1
 DESCRIPTION = {
     "method": str,
@@ -76,6 +84,8 @@ CLAIMS = (
     *("mean_steps", "path_length", "duration", "mean_jerk"),
 )
 """Numbers of `roboarm_nmp.evaluate` that a submission claims for each task."""
+POSE_TOLERANCES = {"ee_tolerance": 0.01, "angle_tolerance": math.radians(15)}
+"""When a goal pose is reached: as in Motion Policy Networks (Fishman et al., 2022)."""
 ROUNDING = 1e-9  # relative, of means that are computed again
 
 
@@ -118,7 +128,27 @@ class TaskActions:
         return self.actions[self.offsets[i] : self.offsets[i + 1]]
 
 
-def queries_digest(queries: Queries) -> str:
+def benchmark_queries(task: str, problems: str | Path | None = None) -> Queries | Problems:
+    """The queries of a task; of a set of problems, those in `problems`/TASK.h5.
+
+    Raises SubmissionError: the set is not there, or some of its problems cannot be used.
+    """
+    if task not in PROBLEM_SETS:
+        return load_queries(task)
+    if problems is None:
+        raise SubmissionError(f"{task}: needs MotionBenchMaker's problems (--problems FOLDER)")
+    try:
+        return problem_queries(Path(problems) / f"{task}.h5")
+    except (DatasetError, EvaluationError, OSError) as error:
+        raise SubmissionError(f"{task}: {error}") from error
+
+
+def _env_task(task: str) -> str:
+    """The task whose environment the queries of `task` are solved in."""
+    return "no_obstacles" if task in PROBLEM_SETS else task
+
+
+def queries_digest(queries: Queries | Problems) -> str:
     """SHA-256 of queries and their scenes, which tells versions of a task apart."""
     digest = hashlib.sha256(queries.start.tobytes() + queries.goal.tobytes())
     for i in range(len(queries)):
@@ -136,6 +166,7 @@ def write_submission(
     tasks: Iterable[str],
     num_queries: int = 1000,
     progress: bool = False,
+    problems: str | Path | None = None,
     **options: Any,
 ) -> dict[str, Any]:
     """Run a method on the first test queries of tasks, and write its submission.
@@ -148,8 +179,9 @@ def write_submission(
         description: values of `DESCRIPTION`; `observes` and `privileged` are filled in for policies
             by name.
         tasks: names of tasks.
-        num_queries: of each task.
+        num_queries: of each task, at most; a set of problems may have fewer.
         progress: show a progress bar.
+        problems: folder with a file SET.h5 for each set of problems among the tasks.
 
     Returns:
         The contents of `submission.yaml`.
@@ -165,20 +197,21 @@ def write_submission(
         document = read_description(folder)
         if document["method"] != description["method"]:
             raise SubmissionError(f"{folder} holds a submission of {document['method']!r}")
+    if options.get("goal_type") == "pose":
+        options["env"] = POSE_TOLERANCES
     for task in tasks:
         if task in document["tasks"]:
             write_line(f"{task}: done before")
             continue
-        write_line(f"{task}: {num_queries:,} queries")
-        result, episodes = record(
-            policy, task, num_queries=num_queries, progress=progress, **options
-        )
-        queries = load_queries(task)[:num_queries]
+        queries = benchmark_queries(task, problems)[:num_queries]
+        write_line(f"{task}: {len(queries):,} queries")
+        env_task = _env_task(task)
+        result, episodes = record(policy, env_task, queries=queries, progress=progress, **options)
         contents = _task_bytes(task, result, queries_digest(queries), episodes)
         write_atomically(folder / f"{task}.h5", contents)
         seconds = np.mean([episode.seconds for episode in episodes])
         document["tasks"][task] = {
-            "num_queries": num_queries,
+            "num_queries": len(queries),
             "sha256": hashlib.sha256(contents).hexdigest(),
             **{name: result[name] for name in CLAIMS},
             "seconds_per_query": float(f"{seconds:.3g}"),
@@ -236,7 +269,7 @@ def read_description(folder: str | Path) -> dict[str, Any]:
     if not isinstance(tasks, dict) or not tasks:
         raise SubmissionError(f"{path}: tasks must be a mapping from tasks to results")
     for task, claims in tasks.items():
-        if task not in envs.TASKS:
+        if task not in (*envs.TASKS, *PROBLEM_SETS):
             raise SubmissionError(f"{path}: no such task: {task}")
         numbers = [claims.get(name) for name in CLAIMS] if isinstance(claims, dict) else [""]
         if not all(number is None or type(number) in (int, float) for number in numbers):
@@ -266,7 +299,7 @@ def read_actions(folder: str | Path, task: str) -> TaskActions:
                     ("seconds", np.float32),
                 )
             )
-            joints = envs.get_task(task).base_scene.robot.num_joints
+            joints = envs.get_task(_env_task(task)).base_scene.robot.num_joints
             offsets = offsets_of(length)
             actions = _array(path, file, "actions", np.float32, (int(offsets[-1]), joints))
     except DatasetError as error:
@@ -301,7 +334,10 @@ def _array(path, file: h5py.File, name, dtype, shape=None) -> np.ndarray:
 
 
 def verify_submission(
-    folder: str | Path, num_workers: int = 1, progress: bool = False
+    folder: str | Path,
+    num_workers: int = 1,
+    progress: bool = False,
+    problems: str | Path | None = None,
 ) -> dict[str, Any]:
     """Replay every episode of a submission, and compare with what it claims.
 
@@ -309,6 +345,7 @@ def verify_submission(
         folder: of the submission.
         num_workers: processes.
         progress: show a progress bar per task.
+        problems: as of `write_submission`.
 
     Returns:
         The row for the table: the contents of `submission.yaml`, its numbers computed again, with
@@ -325,13 +362,13 @@ def verify_submission(
         episodes = read_actions(folder, task)
         if claims.get("sha256") != hashlib.sha256(path.read_bytes()).hexdigest():
             write_line(f"{path}: changed since submission.yaml was written")
-        available = load_queries(task)
+        available = benchmark_queries(task, problems)
         if len(episodes) > len(available):
             raise SubmissionError(f"{path}: {task} has {len(available)} test queries only")
         queries = available[: len(episodes)]
         if episodes.queries_digest != queries_digest(queries):
             raise SubmissionError(f"{path}: made with other queries or scenes than {task} has here")
-        outcomes = _replay_all(path, episodes, num_workers, progress)
+        outcomes = _replay_all(path, episodes, queries, num_workers, progress)
         numbers = rates_and_means(outcomes)
         for name in CLAIMS:
             claim = claims.get(name)
@@ -344,6 +381,7 @@ def verify_submission(
             "num_queries": len(episodes),
             "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
             "queries_digest": episodes.queries_digest,
+            "goal_type": episodes.goal_type,
             **{name: numbers[name] for name in CLAIMS},
             **intervals,
             "seconds_per_query": seconds if type(seconds) in (int, float) else None,
@@ -357,11 +395,11 @@ def _agree(claimed: float | None, number: float | None) -> bool:
     return bool(np.isclose(claimed, number, rtol=ROUNDING, atol=0.0))
 
 
-def _replay_all(path, episodes, num_workers, progress) -> list[Outcome]:
+def _replay_all(path, episodes, queries, num_workers, progress) -> list[Outcome]:
     """The outcomes of all queries, in their order."""
     count = len(episodes)
     chunks = [range(first, min(first + CHUNK, count)) for first in range(0, count, CHUNK)]
-    make = functools.partial(_Replayer, path.parent, episodes.task)
+    make = functools.partial(_Replayer, path.parent, episodes.task, queries)
     if num_workers == 1:
         results = map(make(), chunks)
     else:
@@ -384,13 +422,15 @@ def _replay_all(path, episodes, num_workers, progress) -> list[Outcome]:
 class _Replayer:
     """Replays the episodes of a task, chunk by chunk."""
 
-    def __init__(self, folder: Path, task: str):
+    def __init__(self, folder: Path, task: str, queries: Queries | Problems):
         self.episodes = read_actions(folder, task)
-        self.queries = load_queries(task)
+        self.queries = queries
+        tolerances = POSE_TOLERANCES if self.episodes.goal_type == "pose" else {}
         self.env = envs.make(
-            task,
+            _env_task(task),
             goal_type=self.episodes.goal_type,
             action_mode=self.episodes.action_mode,
+            **tolerances,
         )
 
     def __call__(self, indices: range) -> tuple[range, list[tuple[Outcome, str | None]]]:
@@ -401,7 +441,9 @@ class _Replayer:
         episodes = self.episodes
         actions = episodes.of_query(index)
         mistake = None
-        episode = Episode(self.env, self.queries[index])
+        queries = self.queries
+        query = Query(queries.start[index], queries.goal[index], queries.scenes[index])
+        episode = Episode(self.env, query)
         for number, action in enumerate(actions):
             if episode.ended:
                 mistake = f"it ends after {number} of {len(actions)} actions"
