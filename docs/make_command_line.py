@@ -66,19 +66,24 @@ replays all of it, and `roboarm benchmark table FOLDER` prints the table of veri
 |---|---|---|
 | `--policy`, `--function` or `--program` |  | the method |
 | `--output` |  | folder of the entry |
-| `--tasks` | all of the tracks | tasks to run |
+| `--tasks` | all of the tracks but MotionBenchMaker's | tasks to run |
+| `--problems` |  | folder of MotionBenchMaker's sets, a file SET.h5 each |
 | `--num-queries` | `1000` | test queries of each task |
 | `--quick` | `no` | 50 queries of each task |
 | `--workers` | cores | processes |
 | `--seed` | `0` | of the method's random numbers |
 | `--observes` |  | what the method is given of the scene |
 | `--searches` | `no` | the method searches for paths |
+| `--safety-margin` |  | m, of a safety filter around the policy; 0 for none |
+| `--search` | `no` | a policy that draws paths searches where it can verify none |
+| `--pose-goals` | `no` | goals are poses, reached at 1 cm and 15 degrees |
 | `--name`, `--authors`, `--link`, `--licence` |  | what the table says about the method |
 | `--training-data`, `--training-seeds`, `--hardware` |  | likewise |
 | `--developed-on` |  | tasks whose scenes its makers looked at or tuned on |
 
 | flag of `verify` | default | meaning |
 |---|---|---|
+| `--problems` |  | as of `run` |
 | `--workers` | cores | processes |
 | `--row` |  | write the verified row of the table to this file |
 """,

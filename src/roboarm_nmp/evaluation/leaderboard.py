@@ -46,7 +46,7 @@ def leaderboard(folder: str | Path) -> str:
                     tables.append(f"### `{task}`{goals}\n\n{_table(task, suitable, has_poses)}\n")
         if tables:
             parts += [f"## {track[0].upper()}{track[1:]}\n", *tables]
-    return "\n".join(parts).rstrip() + "\n"
+    return "\n".join(parts).rstrip()
 
 
 def _has_pose_goals(row: dict[str, Any], task: str) -> bool:
@@ -70,7 +70,7 @@ def _table(task: str, rows: list[dict[str, Any]], has_poses: bool) -> str:
     lines = ["| " + " | ".join(columns) + " |", "|" + " --- |" * len(columns)]
     for observes, searches in CLASSES:
         group = [row for row in rows if (row["observes"], row["searches"]) == (observes, searches)]
-        group.sort(key=lambda row: -row["tasks"][task]["success_rate"])
+        group.sort(key=lambda row: _rank(row["tasks"][task]))
         if group:
             search = "searches" if searches else "no search"
             privileged = ", privileged" if observes == "ground truth" else ""
@@ -78,6 +78,12 @@ def _table(task: str, rows: list[dict[str, Any]], has_poses: bool) -> str:
             lines.append(f"| {title} |" + " |" * (len(columns) - 1))
             lines += [_line(row, row["tasks"][task], task) for row in group]
     return "\n".join(lines)
+
+
+def _rank(numbers: dict[str, Any]) -> tuple[float, ...]:
+    """Smaller for a better row: more success, then less contact, then shorter paths."""
+    rates = -numbers["success_rate"], -numbers["collision_free_success_rate"]
+    return *rates, numbers["path_length"] or 0.0
 
 
 def _line(row: dict[str, Any], numbers: dict[str, Any], task: str) -> str:
