@@ -10,6 +10,7 @@ simplifies it. Run the command in this folder.
 
 import functools
 import time
+from typing import Any
 
 import numpy as np
 from ompl import base as ob
@@ -54,11 +55,11 @@ def plan(planner, problem):
     information.setMotionValidator(Motions(information))
     information.setup()
     definition = ob.ProblemDefinition(information)
-    states = [information.allocState() for _ in ends]
+    states: list[Any] = [information.allocState() for _ in ends]
     for state, end in zip(states, ends, strict=True):
         for i in joints:
             state[i] = float(end[i])
-    definition.setStartAndGoalStates(*states)
+    definition.setStartAndGoalStates(states[0], states[1])
     definition.setOptimizationObjective(ob.PathLengthOptimizationObjective(information))
     search = planner(information)
     search.setProblemDefinition(definition)
@@ -67,7 +68,7 @@ def plan(planner, problem):
     search.solve(ob.PlannerTerminationCondition(lambda: time.process_time() > deadline))
     if not definition.hasExactSolution():
         return None
-    path = definition.getSolutionPath()
+    path: Any = definition.getSolutionPath()
     og.PathSimplifier(information).simplifyMax(path)
     return robot.denormalise(np.array([values(state) for state in path.getStates()]))
 

@@ -42,7 +42,7 @@ def begin(problem):
         names = list(problem.robot.joint_names)
         ends = [core.JointConfiguration(names, end) for end in (problem.start, problem.goal)]
         try:
-            path = planner.plan(*ends)
+            path = planner.plan(ends[0], ends[1])
         except RuntimeError:
             continue
         cut = core.PathShortcuttingOptions(group_name=ARM, max_step_size=STEP, seed=0)

@@ -84,7 +84,7 @@ CLAIMS = (
     *("mean_steps", "path_length", "duration", "mean_jerk"),
 )
 """Numbers of `roboarm_nmp.evaluate` that a submission claims for each task."""
-POSE_TOLERANCES = {"ee_tolerance": 0.01, "angle_tolerance": math.radians(15)}
+POSE_TOLERANCES: dict[str, Any] = {"ee_tolerance": 0.01, "angle_tolerance": math.radians(15)}
 """When a goal pose is reached: as in Motion Policy Networks (Fishman et al., 2022)."""
 ROUNDING = 1e-9  # relative, of means that are computed again
 
