@@ -14,7 +14,7 @@ Table and floor are known to all of them, and so are obstacles with `may_touch`:
 import functools
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from roboarm_nmp.envs.perception.point_clouds import (
     observed_points,
     without_known,
 )
+from roboarm_nmp.envs.perception.visibility import unseen_points
 from roboarm_nmp.envs.robots.panda import PANDA, scale_of
 from roboarm_nmp.envs.scenes.primitives import POINT_RADIUS, ObservedScene, Scene
 from roboarm_nmp.utils.names import suggest
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
     from roboarm_nmp.envs.perception.encoders import NetworkEncoder
 
 GeometrySource = Callable[[Scene], CollisionChecker]
+Unknown = Literal["free", "occupied"]
+"""What space counts as that no sensor sees."""
 GROUND_TRUTH = "ground_truth"
 CACHED_CHECKERS = 64  # about 60 kB each
 CACHED_FINE_CHECKERS = 4  # about 1 MB each
@@ -91,6 +94,21 @@ def fine_observed_checker(scene: Scene) -> CollisionChecker:
         return observed_checker(scene)
     radius = scale_of(scene.robot) * FINE_POINT_RADIUS
     return _checker_of_points(scene, fine_observed_points(scene), radius)
+
+
+def cautious_checker(scene: Scene, states: np.ndarray) -> CollisionChecker:
+    """As `fine_observed_checker`, but space that no sensor sees is occupied, too.
+
+    Args:
+        scene: the `Scene`.
+        states: normalised configurations (m, n), such as start and goal, in which the arm has room.
+    """
+    points = unseen_points(scene, states)
+    if not len(points):
+        return fine_observed_checker(scene)
+    radius = scale_of(scene.robot) * FINE_POINT_RADIUS
+    points = np.concatenate([fine_observed_points(scene), points])
+    return _checker_of_points(scene, points, radius)
 
 
 @functools.lru_cache(CACHED_CHECKERS)

@@ -12,7 +12,7 @@ without labels, `prepare_cloud` removes the others by their distance.
 """
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ import numpy as np
 from roboarm_nmp.envs.collision.checker import LINK_DISTANCE_RANGE
 from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, arm_hulls, shape_rows
 from roboarm_nmp.envs.perception.cloud_kernels import (
+    OF_ARM,
     OF_OBSTACLE,
     farthest,
     first_in_cells,
@@ -29,7 +30,6 @@ from roboarm_nmp.envs.perception.sensors import (
     OBSTACLE,
     PointCloud,
     SceneObservation,
-    SensorWorld,
     cardinal,
     world_of,
 )
@@ -104,24 +104,20 @@ def _thin(scene: Scene, cell: float) -> np.ndarray:
     return one_per_cell(points, scale * cell)
 
 
-@functools.lru_cache(1)  # 500 kB; the coarse and the fine points of a scene are needed together
+@functools.lru_cache(1)  # the coarse and the fine points of a scene are needed together
 def _clouds(scene: Scene) -> np.ndarray:
-    sensors = cardinal(PointCloud, scene.robot).values()
-    return obstacle_points(world_of(scene, len(sensors)), sensors)
-
-
-def obstacle_points(world: SensorWorld, sensors: Iterable[PointCloud]) -> np.ndarray:
-    """All points of obstacles that sensors observe: float32 (n, 3), m, in the base's frame.
-
-    Args:
-        world: an `envs.perception.sensors.SensorWorld`.
-        sensors: `PointCloud`s.
-    """
     clouds = [np.empty((0, 3), np.float32)]
-    for sensor in sensors:
-        depth, classes = world.cast(sensor, sensor.size)
+    for sensor, depth, classes in sensor_images(scene):
         clouds.append(sensor.points_of_class(depth, classes, OBSTACLE))
     return np.concatenate(clouds)
+
+
+@functools.lru_cache(1)
+def sensor_images(scene: Scene) -> list[tuple[PointCloud, np.ndarray, np.ndarray]]:
+    """What the four sensors of a `Scene` see: each with its depth and classes (`cast`)."""
+    sensors = cardinal(PointCloud, scene.robot).values()
+    world = world_of(scene, len(sensors))
+    return [(sensor, *world.cast(sensor, sensor.size)) for sensor in sensors]
 
 
 def one_per_cell(points: np.ndarray, cell: float = CELL) -> np.ndarray:
@@ -142,6 +138,22 @@ def without_known(
     everywhere = np.array([[-np.inf] * 3, [np.inf] * 3])
     labels = _labels(points, everywhere, shape_rows(obstacles), distance)
     return points[labels == OF_OBSTACLE]
+
+
+def are_near_arm(
+    points: np.ndarray, robot: Robot, states: np.ndarray, distance: float
+) -> np.ndarray:
+    """Which points (n, 3), m, are within a distance (m) of an arm in one of its states: bool (n,).
+
+    `states`: normalised configurations (m, j).
+    """
+    points = np.require(points, np.float32, _AS_COMPILED)
+    everywhere = np.array([[-np.inf] * 3, [np.inf] * 3])
+    near = np.zeros(len(points), np.bool_)
+    for state in np.asarray(states, np.float64):
+        labels = _labels(points, everywhere, shape_rows(()), 0.0, robot, state, distance)
+        near |= labels == OF_ARM
+    return near
 
 
 def _labels(

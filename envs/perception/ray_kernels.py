@@ -331,3 +331,31 @@ def pixels_with_neighbours(depth, hit, distance, least):
                     near += hit[r, c] and abs(depth[r, c] - depth[row, column]) <= distance
             kept[row, column] = hit[row, column] and near >= least
     return kept
+
+
+@compiled
+def mark_seen(points, view, depth, behind, seen):
+    """Mark in `seen`, bool (n,), which points (n, 3), m, are not hidden behind what a sensor sees.
+
+    Args:
+        points: float64.
+        view: float64 (`VIEW`,).
+        depth: of the sensor's pixels, float32 (height, width), m.
+        behind: m: a point so far behind what a pixel shows is seen.
+    """
+    height, width = depth.shape
+    for i in range(points.shape[0]):
+        x, y, z = (
+            points[i, 0] - view[EYE],
+            points[i, 1] - view[EYE + 1],
+            points[i, 2] - view[EYE + 2],
+        )
+        ahead = x * view[AXES + 6] + y * view[AXES + 7] + z * view[AXES + 8]
+        if seen[i] or ahead <= view[NEAREST]:
+            continue
+        right = (x * view[AXES] + y * view[AXES + 1] + z * view[AXES + 2]) / view[ACROSS]
+        up = (x * view[AXES + 3] + y * view[AXES + 4] + z * view[AXES + 5]) / view[UPWARDS]
+        column = int(math.floor((1.0 + right / ahead) / 2.0 * width))
+        row = int(math.floor((1.0 - up / ahead) / 2.0 * height))
+        if 0 <= column < width and 0 <= row < height:
+            seen[i] = ahead <= depth[row, column] + behind

@@ -1,23 +1,29 @@
 """Which space the four sensors see: what they do not see may be occupied.
 
 are_seen(scene, points)                # bool (n,)
+unseen_points(scene, states)           # on the boundary of what is not seen, for collision checks
 unobserved_share(scene, states)        # of a motion
 """
 
-import math
+import functools
 
 import numpy as np
 
 from roboarm_nmp.envs.collision.distance_field import DistanceField
-from roboarm_nmp.envs.perception.ray_casting import ROBOT
-from roboarm_nmp.envs.perception.ray_kernels import AXES
-from roboarm_nmp.envs.perception.sensors import PointCloud, cardinal, view_of, world_of
-from roboarm_nmp.envs.scenes.primitives import Scene
+from roboarm_nmp.envs.perception.point_clouds import are_near_arm, sensor_images
+from roboarm_nmp.envs.perception.ray_kernels import mark_seen
+from roboarm_nmp.envs.perception.sensors import SceneObservation, view_of
+from roboarm_nmp.envs.robots.panda import scale_of
+from roboarm_nmp.envs.robots.robot import Robot
+from roboarm_nmp.envs.scenes.primitives import ObservedScene, Scene
 
 TOLERANCE = 0.02
 """m: a point so far behind a visible surface counts as seen."""
-ARM_THICKNESS = 0.2
-"""m: behind the arm's visible surface, so much is the arm itself, whose place is known."""
+UNSEEN_CELL = 0.03
+"""m, for the Panda: one point of each cube of this size stands for space that is not seen."""
+_SHOULDER, _REACH = np.array([0.0, 0.0, 0.333]), 0.95  # m, of the Panda; they scale with the arm
+ARM_DISTANCE = 0.03
+"""m: so much around an arm that is known to have room counts as seen."""
 
 
 def are_seen(scene: Scene, points: np.ndarray) -> np.ndarray:
@@ -28,25 +34,59 @@ def are_seen(scene: Scene, points: np.ndarray) -> np.ndarray:
             `SceneObservation`, where it is).
         points: m, (n, 3), in the base's frame.
     """
-    sensors = cardinal(PointCloud, scene.robot).values()
-    world = world_of(scene, len(sensors))
+    points = np.require(points, np.float64, ("C", "W"))
     seen = np.zeros(len(points), np.bool_)
-    for sensor in sensors:
-        depth, classes = world.cast(sensor, sensor.size)
-        width, height = sensor.size
-        right, up, forward = view_of(sensor, sensor.size)[AXES : AXES + 9].reshape(3, 3)
-        half = math.tan(math.radians(sensor.field_of_view) / 2)
-        away = points - np.array(sensor.eye)
-        ahead = away @ forward
-        in_front = ahead > sensor.near
-        scaled = 1.0 / (np.where(in_front, ahead, 1.0) * half)
-        column = np.floor((1.0 + away @ right * scaled * height / width) / 2 * width).astype(int)
-        row = np.floor((1.0 - away @ up * scaled) / 2 * height).astype(int)
-        inside = in_front & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        row, column = row[inside], column[inside]
-        behind = np.where(classes[row, column] == ROBOT, ARM_THICKNESS, TOLERANCE)
-        seen[inside] |= ahead[inside] <= depth[row, column] + behind
+    for sensor, depth, _ in sensor_images(scene):
+        view = view_of(sensor, sensor.size)
+        mark_seen(points, view, depth, TOLERANCE, seen)
+    hidden = ~seen
+    seen[hidden] = are_near_arm(points[hidden], scene.robot, [_observed(scene)], ARM_DISTANCE)
     return seen
+
+
+def _observed(scene):
+    """The normalised configuration of the arm when a scene was observed."""
+    of_observation = isinstance(scene, SceneObservation)
+    configuration = scene.configuration if of_observation else scene.robot.observed_pose
+    return np.clip(scene.robot.normalise(configuration), -1.0, 1.0)
+
+
+def unseen_points(scene: Scene, states: np.ndarray) -> np.ndarray:
+    """Points on the boundary of the space that no sensor sees: float32 (n, 3), m.
+
+    There is one in each cube of `UNSEEN_CELL` in the arm's reach that is not seen, if a neighbour
+    is. Of an `ObservedScene`, nothing is known of what was seen: none.
+
+    Args:
+        scene: as for `are_seen`.
+        states: normalised configurations (m, n), for example start and goal, in which the arm has
+            room: there are no points within `ARM_DISTANCE` of it.
+    """
+    if isinstance(scene, ObservedScene):
+        return np.empty((0, 3), np.float32)
+    places, in_reach = _places(scene.robot.arm)
+    seen = np.zeros(in_reach.shape, np.bool_)
+    seen[in_reach] = are_seen(scene, places)
+    around = np.pad(seen, 1)
+    near = np.zeros(seen.shape, np.bool_)
+    for axis in range(3):
+        for begin in (0, 2):
+            part = [slice(1, -1)] * 3
+            part[axis] = slice(begin, begin + seen.shape[axis])
+            near |= around[tuple(part)]
+    points = places[(~seen & near)[in_reach]].astype(np.float32)
+    return points[~are_near_arm(points, scene.robot, states, ARM_DISTANCE)]
+
+
+@functools.lru_cache(8)
+def _places(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Centres of cubes in a robot's reach, m, (k, 3), and which ones of a grid they are, bool."""
+    scale = scale_of(robot)
+    half = int(_REACH / UNSEEN_CELL) + 1
+    along = np.arange(-half, half + 1) * UNSEEN_CELL
+    places = np.stack(np.meshgrid(along, along, along, indexing="ij"), -1)
+    in_reach = np.linalg.norm(places, axis=-1) <= _REACH
+    return scale * (places[in_reach] + _SHOULDER) + np.array(robot.base_position), in_reach
 
 
 def unobserved_share(scene: Scene, states: np.ndarray) -> float:
@@ -59,4 +99,4 @@ def unobserved_share(scene: Scene, states: np.ndarray) -> float:
         states: normalised configurations (m, n).
     """
     centres = DistanceField(scene.robot).centres(states)
-    return float(1.0 - are_seen(scene, centres.reshape(-1, 3).astype(np.float64)).mean())
+    return float(1.0 - are_seen(scene, centres.reshape(-1, 3)).mean())

@@ -30,7 +30,7 @@ from roboarm_nmp.datasets.queries import Query, load_queries, validate
 from roboarm_nmp.envs.arm_env import Observation, RoboArmEnv, deviations
 from roboarm_nmp.envs.goals import GOAL_TYPES, GoalTypeName
 from roboarm_nmp.envs.perception.encoders import ORACLE
-from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH
+from roboarm_nmp.envs.perception.geometry_source import GROUND_TRUTH, Unknown
 from roboarm_nmp.envs.perception.noise import SensorNoise
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD
 from roboarm_nmp.envs.robots.control import STEP_SECONDS
@@ -103,6 +103,8 @@ class EvaluationOptions:
             (`policies.replanning.ReplanWhenStuck`), among the geometry source's obstacles.
         search: a policy that draws paths searches for one where it can verify none
             (`policies.generative`).
+        unknown: what space counts as that no sensor sees, `free` or `occupied`, for a policy that
+            draws paths; None: occupied, and free only where it finds no path otherwise.
         observe_every: steps from one observation of the scene to the next; None: static scenes are
             observed once (`envs.wrappers.ObservedSceneWrapper`).
         sensor_noise: a `envs.perception.noise.SensorNoise`; None for none.
@@ -134,6 +136,7 @@ class EvaluationOptions:
     safety_filter: SafetyFilter | Literal[False] | None = None
     replan: bool = False
     search: bool = False
+    unknown: Unknown | None = None
     observe_every: int | None = None
     sensor_noise: SensorNoise | None = None
     action_delay: int = 0
@@ -331,6 +334,7 @@ class _Job:
             safety_filter=options.safety_filter or False,
             replan=options.replan,
             search=options.search,
+            unknown=options.unknown,
         )
         return env, begin
 
@@ -736,6 +740,8 @@ def _summary(job: _Job, outcomes: list[Outcome]) -> dict[str, Any]:
     if policy not in BASELINES and outcomes[0]["plan_found"] is not None:
         result["verified_rate"] = sum(outcome["plan_found"] for outcome in outcomes) / count
         result["planning_seconds"] = _mean(outcomes, "planning_seconds")
+    if options.unknown:
+        result["unknown"] = options.unknown
     if options.search:
         result["search"] = True
         result["search_rate"] = sum(outcome["searched"] for outcome in outcomes) / count

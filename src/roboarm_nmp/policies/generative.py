@@ -9,7 +9,8 @@ away from observed points (`envs.collision.distance_field`), and checked in the 
 (`envs.collision.checker`). The shortest path that keeps the first of `MARGINS` is shortened and
 followed. Where no draw does, paths are drawn again from the best ones with new noise, then
 assembled from parts of all draws, then smaller margins do; last, where that is allowed, a path is
-searched for. Otherwise the arm follows the draw with the fewest contacts.
+searched for. Space that no sensor sees counts as occupied at first; where no path is found so, as
+free. Otherwise the arm follows the draw with the fewest contacts.
 """
 
 import numpy as np
@@ -19,7 +20,11 @@ from roboarm_nmp.envs.arm_env import RoboArmEnv
 from roboarm_nmp.envs.collision.checker import RESOLUTION, CollisionChecker, Rules
 from roboarm_nmp.envs.collision.distance_field import DistanceField
 from roboarm_nmp.envs.perception.encoders import make_encoder
-from roboarm_nmp.envs.perception.geometry_source import find_geometry_source
+from roboarm_nmp.envs.perception.geometry_source import (
+    Unknown,
+    cautious_checker,
+    fine_observed_checker,
+)
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, observed_points
 from roboarm_nmp.networks.network_file import Network
 from roboarm_nmp.networks.untrusted import NetworkError
@@ -50,15 +55,24 @@ class Generative:
         env: the `RoboArmEnv`.
         seed: of the noise, >= 0; each query has its own generator.
         search: whether a path is searched for where no draw can be verified.
+        unknown: what space is that no sensor sees: `free`, `occupied`; None: occupied at first, and
+            free where no path is found otherwise.
     """
 
-    def __init__(self, network: Network, env: RoboArmEnv, seed: int = 0, search: bool = False):
+    def __init__(
+        self,
+        network: Network,
+        env: RoboArmEnv,
+        seed: int = 0,
+        search: bool = False,
+        unknown: Unknown | None = None,
+    ):
         self._robot = env.robot
         self._env = env
         self._seed = seed
         self._search = search
         self._field = DistanceField(self._robot)
-        self._source = find_geometry_source(POINT_CLOUD, self._robot, fine=True)
+        self._unknown = unknown
         self._network = network
         self._paths = PathsOfNetwork(network, self._field)
 
@@ -67,9 +81,20 @@ class Generative:
         rng = np.random.default_rng([self._seed, number])
         ends = np.clip(self._robot.normalise([query.start, query.goal]), -1.0, 1.0)
         draw = self._paths.begin(scene, *ends.astype(np.float32))
-        path, verified, searched = find_path(draw, self._source(scene), ends, rng, self._search)
-        path = self._robot.denormalise(path)
-        return EpisodePolicy(follow_path(path, self._robot), verified, searched)
+        searched = False
+        for checker in self._checkers(scene, ends):
+            path, verified, by_search = find_path(draw, checker, ends, rng, self._search)
+            searched |= by_search
+            if verified:
+                break
+        act = follow_path(self._robot.denormalise(path), self._robot)
+        return EpisodePolicy(act, verified, searched)
+
+    def _checkers(self, scene, ends):
+        if self._unknown != "free":
+            yield cautious_checker(scene, ends)
+        if self._unknown != "occupied":
+            yield fine_observed_checker(scene)
 
 
 class PathsOfNetwork:

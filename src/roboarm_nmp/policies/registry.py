@@ -36,6 +36,7 @@ from roboarm_nmp.policies.pose_goals import ConfigurationGoals
 from roboarm_nmp.utils.names import suggest
 
 if TYPE_CHECKING:  # Numba takes a while to import
+    from roboarm_nmp.envs.perception.geometry_source import Unknown
     from roboarm_nmp.policies.safety_filter import SafetyFilter
 
 # The arguments of an environment that a policy's metadata may contain. Tolerances and horizon are
@@ -184,6 +185,7 @@ def make_policy(
     safety_filter: "SafetyFilter | Literal[False] | None" = None,
     replan: bool = False,
     search: bool = False,
+    unknown: "Unknown | None" = None,
 ) -> BeginEpisode:
     """A policy in an environment: a function (query's number, `Query`) -> `EpisodePolicy`.
 
@@ -203,12 +205,15 @@ def make_policy(
         geometry_source: where `via-points`, `planner` and `replanning` take the obstacles from:
             `ground_truth`, `point_cloud` or an encoder's name (`envs.perception.geometry_source`).
         safety_filter: a `policies.safety_filter.SafetyFilter` around the policy; None for the
-            one that a trained policy includes, if any; False for none. The environment must have
+            one that a trained policy includes, if any; False for none. In a static scene, one that
+            a policy includes does not change a motion that was verified. The environment must have
             `link_distances`, whose geometry source is the filter's.
         replan: whenever the policy is stuck, follow a plan for a while
             (`policies.replanning.ReplanWhenStuck`); a safety filter then makes no escapes.
         search: a policy that draws paths searches for one where it can verify none
             (`policies.generative`).
+        unknown: what space counts as that no sensor sees, `free` or `occupied`, for a policy that
+            draws paths; None: occupied, and free only where it finds no path otherwise.
 
     Raises:
         PolicyError: the policy cannot act in this environment.
@@ -224,17 +229,19 @@ def make_policy(
         except ValueError as error:
             raise PolicyError(str(error)) from error
     else:
-        begin, as_observed = _trained(policy, env, seed, search)
+        begin, as_observed = _trained(policy, env, seed, search, unknown)
+    own = own_safety_filter(policy)
     if safety_filter is None:
-        safety_filter = own_safety_filter(policy)
+        safety_filter = own
     if replan:
         begin = _replanned(begin, env, seed, geometry_source)
     if safety_filter:
-        begin = _filtered(begin, env, seed, filter_around(policy, safety_filter, replan))
+        around = filter_around(policy, safety_filter, replan)
+        begin = _filtered(begin, env, seed, around, trust_verified=safety_filter == own)
     return begin if as_observed is None else _translated(begin, as_observed)
 
 
-def _filtered(begin, env, seed, safety_filter):
+def _filtered(begin, env, seed, safety_filter, trust_verified):
     # Here, because Numba takes a while to import.
     from roboarm_nmp.policies.safety_filter import check_env
 
@@ -245,7 +252,9 @@ def _filtered(begin, env, seed, safety_filter):
 
     def begin_filtered(number, query):
         begun = begin(number, query)
-        if begun.act is None:
+        # The filter sees a coarser cloud than the one in which the motion was verified.
+        verified = trust_verified and begun.plan_found and query.scene.is_static
+        if begun.act is None or verified:
             return begun
         rng = np.random.default_rng([seed, number])
         return begun._replace(act=safety_filter.filter_policy(begun.act, env, rng))
@@ -322,7 +331,7 @@ def _load(path: str | Path) -> _TrainedPolicy:
     return _TrainedPolicy(network, arguments, safety_filter, size)
 
 
-def _trained(path, env, seed, search):
+def _trained(path, env, seed, search, unknown):
     """`make_policy` of a policy network, and its `ConfigurationGoals`, None if it needs none."""
     network, trained, _, size = _load(path)
     robot = env.unwrapped.robot
@@ -342,11 +351,11 @@ def _trained(path, env, seed, search):
         from roboarm_nmp.policies.generative import Generative
 
         try:
-            return Generative(network, env, seed, search), None
+            return Generative(network, env, seed, search, unknown), None
         except NetworkError as error:
             raise PolicyError(f"{path}: {error}") from error
-    if search:
-        raise PolicyError(f"{path}: search is for policies that draw paths")
+    if search or unknown is not None:
+        raise PolicyError(f"{path}: search and unknown are for policies that draw paths")
 
     # One observation at a time: in a batch its last bits would depend on the batch's size, for a
     # gain of a tenth of the time at most.
