@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from roboarm_nmp.envs.perception.visibility import are_seen, unobserved_share
+from roboarm_nmp.envs.perception.visibility import are_seen, unobserved_share, unseen_points
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 
+START = PANDA.normalise([[0.0, 0.6, 0.0, -1.9, 0.0, 2.5, 0.8]])  # the hand is in the box
 CENTRE, EDGE = np.array([0.5, 0.0, 0.4]), 0.3
 
 
@@ -26,5 +27,8 @@ def test_inside_of_a_closed_box_is_not_seen_and_space_around_it_is():
     assert are_seen(Scene(), inside).all()
     observed = PANDA.normalise(np.array([PANDA.observed_pose]))
     assert unobserved_share(Scene(), observed) == 0.0  # the arm itself is known
+    around = unseen_points(scene, observed)
+    assert (np.abs(around - CENTRE) < EDGE / 2).all(1).any()
+    assert not are_seen(scene, around).any() and len(unseen_points(scene, START)) < len(around)
     states = rng.uniform(-1.0, 1.0, (200, 7))
     assert unobserved_share(Scene(), states) < unobserved_share(scene, states) < 0.1

@@ -11,7 +11,6 @@ from roboarm_nmp.datasets.problem_formats import Problem
 from roboarm_nmp.datasets.problems import load_problems, write_problems
 from roboarm_nmp.envs.collision.checker import ARM, CollisionChecker
 from roboarm_nmp.envs.following import follow
-from roboarm_nmp.envs.perception.point_clouds import obstacle_points
 from roboarm_nmp.envs.perception.sensors import OBSTACLE, ROBOT, Camera, PointCloud, SensorWorld
 from roboarm_nmp.envs.robots.metadata import check_robot
 from roboarm_nmp.envs.robots.panda import PANDA
@@ -134,7 +133,8 @@ def test_sensors_see_an_object_as_the_arm_and_no_points_of_it():
         world.show(Scene((wall,), robot=robot), START)
         depth, classes = world.cast(camera, camera.size)
         seen.append((classes[32, 32], depth[32, 32] < 0.5))
-        points = obstacle_points(world, [PointCloud(camera.eye, camera.target)])
+        sensor = PointCloud(camera.eye, camera.target)
+        points = sensor.points_of_class(*world.cast(sensor, sensor.size), OBSTACLE)
         assert len(points) > 1000 and points[:, 1].max() < -0.449
     assert seen == [(OBSTACLE, False), (ROBOT, True)]
     world.close()
