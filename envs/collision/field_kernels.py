@@ -13,10 +13,10 @@ from roboarm_nmp.envs.collision.arm_kernels import (
     SPAN,
     place_arm,
 )
+from roboarm_nmp.envs.collision.lanes_kernels import WIDTH, load, smaller, spread, store
 from roboarm_nmp.utils.numba_cache import compiled, uncounted
 
 LOWEST, HIGHEST = -0.05, 0.2  # m: distances in a field are clipped to these
-_WIDTH = 16  # places that are compared with a point at a time, a vector's
 STEP = (HIGHEST - LOWEST) / 255.0  # m: they are stored as uint8
 
 
@@ -30,7 +30,7 @@ def fill_field(points, boxes, low, cell, sizes):
     nx, ny, nz = sizes
     farthest = np.float32(HIGHEST * HIGHEST)
     field = np.full(nx * ny * nz, farthest)
-    along = np.empty(_WIDTH, np.float32)  # squared distances in a row
+    along = np.empty(WIDTH, np.float32)  # squared distances in a row
     steps = int(math.ceil(HIGHEST / cell))
     for n in range(points.shape[0]):
         u = (points[n, 0] - low[0]) / cell
@@ -38,9 +38,9 @@ def fill_field(points, boxes, low, cell, sizes):
         w = (points[n, 2] - low[2]) / cell
         low_a, high_a = max(int(u) - steps, 0), min(int(u) + steps + 2, nx)
         low_b, high_b = max(int(v) - steps, 0), min(int(v) + steps + 2, ny)
-        for first in range(max(int(w) - steps, 0), min(int(w) + steps + 2, nz), _WIDTH):
-            first = min(first, nz - _WIDTH)
-            for i in range(_WIDTH):
+        for first in range(max(int(w) - steps, 0), min(int(w) + steps + 2, nz), WIDTH):
+            first = min(first, nz - WIDTH)
+            for i in range(WIDTH):
                 along[i] = ((first + i - w) * cell) ** 2
             for a in range(low_a, high_a):
                 for b in range(low_b, high_b):
@@ -51,31 +51,45 @@ def fill_field(points, boxes, low, cell, sizes):
     for a in range(nx):
         for b in range(ny):
             for c in range(nz):
-                nearest = math.sqrt(field[(a * ny + b) * nz + c])
-                for i in range(boxes.shape[0]):
-                    nearest = min(nearest, _box_distance(a, b, c, boxes[i], low, cell))
-                nearest = min(max(nearest, LOWEST), HIGHEST)
-                numbers[a, b, c] = int((nearest - LOWEST) / STEP + 0.5)
+                numbers[a, b, c] = _number(math.sqrt(field[(a * ny + b) * nz + c]))
+    for i in range(boxes.shape[0]):
+        _lower_to_box(numbers, boxes[i], low, cell)
     return numbers
+
+
+@compiled
+def _number(distance):
+    return int((min(max(distance, LOWEST), HIGHEST) - LOWEST) / STEP + 0.5)
+
+
+@compiled
+def _lower_to_box(numbers, box, low, cell):
+    """Lower the numbers of a field to those of the distances from one box."""
+    away = np.empty((3, max(numbers.shape)))  # along each axis; negative inside
+    for axis in range(3):
+        for i in range(numbers.shape[axis]):
+            place = low[axis] + cell * i
+            away[axis, i] = max(box[0, axis] - place, place - box[1, axis])
+    for a in range(numbers.shape[0]):
+        for b in range(numbers.shape[1]):
+            if max(away[0, a], away[1, b]) >= HIGHEST:
+                continue
+            for c in range(numbers.shape[2]):
+                inside, outside = -1e9, 0.0
+                if away[2, c] >= HIGHEST:
+                    continue
+                for one in (away[0, a], away[1, b], away[2, c]):
+                    inside = max(inside, one)
+                    outside += max(one, 0.0) ** 2
+                distance = inside if inside < 0.0 else math.sqrt(outside)
+                numbers[a, b, c] = min(numbers[a, b, c], _number(distance))
 
 
 @uncounted
 def _lower(field, begin, across, along):
-    """Lower `_WIDTH` squared distances in a row to those from one point."""
-    for i in range(_WIDTH):
-        squared = across + along[i]
-        field[begin + i] = squared if squared < field[begin + i] else field[begin + i]
-
-
-@compiled
-def _box_distance(a, b, c, box, low, cell):
-    inside, outside = -1e9, 0.0
-    for axis in range(3):
-        place = low[axis] + cell * (a if axis == 0 else b if axis == 1 else c)
-        away = max(box[0, axis] - place, place - box[1, axis])
-        inside = max(inside, away)
-        outside += max(away, 0.0) ** 2
-    return inside if inside < 0.0 else math.sqrt(outside)
+    """Lower `WIDTH` squared distances in a row to those from one point."""
+    squared = load(along, 0) + spread(across)
+    store(field, begin, smaller(squared, load(field, begin)))
 
 
 @compiled

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from roboarm_nmp.utils.numba_cache import compiled
+from roboarm_nmp.envs.collision.lanes_kernels import WIDTH, load, smaller, store
+from roboarm_nmp.utils.numba_cache import compiled, uncounted
 
 _CELL = 0.03  # m
 _MAX_CELLS = 1_000_000  # of a cloud that is spread out, cells are larger
@@ -42,11 +43,13 @@ def distance_grid(points, farthest, within):
         low[axis] -= reach
         numbers[axis] = int((high[axis] + reach - low[axis]) / cell) + 1
         place[axis] = low[axis]
+    numbers[2] = max(numbers[2], WIDTH)
     place[3], place[4] = 1.0 / cell, within
     nx, ny, nz = numbers[0], numbers[1], numbers[2]
     # Squared distances of the cells' centres.
     near = np.full(nx * ny * nz, np.float32((within + cell) ** 2))
     steps = int(reach / cell) + 1
+    ramp = np.arange(WIDTH).astype(np.float32)
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         if x * x + y * y + z * z >= farthest * farthest:
@@ -59,7 +62,9 @@ def distance_grid(points, farthest, within):
                 if across >= reach * reach:
                     continue
                 row = (a * ny + b) * nz
-                _lower(near, row + first, row + last, across, first + 0.5 - w, cell)
+                for c in range(first, last, WIDTH):
+                    c = min(c, nz - WIDTH)
+                    _lower(near, row + c, across, c + 0.5 - w, cell, ramp)
     # A place is at most half a cell's diagonal from its centre. (And 1 um for rounding.)
     half = 0.5 * math.sqrt(3.0) * cell + 1e-6
     for i in range(near.shape[0]):
@@ -67,11 +72,9 @@ def distance_grid(points, farthest, within):
     return near, numbers, place
 
 
-@compiled
-def _lower(near, begin, end, across, along, cell):
-    """Lower squared distances in a row of cells to those from one point."""
-    across, along, cell = np.float32(across), np.float32(along), np.float32(cell)
-    for i in range(begin, end):
-        there = (np.float32(i - begin) + along) * cell
-        squared = across + there * there
-        near[i] = squared if squared < near[i] else near[i]
+@uncounted
+def _lower(near, begin, across, along, cell, ramp):
+    """Lower squared distances in a row of `WIDTH` cells to those from one point."""
+    there = (load(ramp, 0) + np.float32(along)) * np.float32(cell)
+    squared = there * there + np.float32(across)
+    store(near, begin, smaller(squared, load(near, begin)))

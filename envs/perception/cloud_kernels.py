@@ -75,12 +75,12 @@ def _slot(table, cells, x, y, z):
 
 
 @compiled
-def first_in_cells(points, cell):
+def first_in_cells(points, cell, count_around):
     """The first of the points (n, 3), m, in each cube with edges of `cell`, m, of their type.
 
     Returns, for the m cubes in the order of their first points: int64 (m,), the index of that
-    point; int32 (n,), the cube of each point; int64 (m,), how many points the cube and the 26
-    around it have.
+    point; int32 (n,), the cube of each point; int64 (m,), how many points the cube and, with
+    `count_around`, the 26 around it have.
     """
     cubes = np.empty(points.shape[0], np.int32)
     table = np.full(1024, -1, np.int64)  # of indices of cubes; twice as many as fit into `cells`
@@ -107,6 +107,8 @@ def first_in_cells(points, cell):
             m += 1
         cubes[i] = table[slot]
         count[cubes[i]] += 1
+    if not count_around:
+        return first[:m], cubes, count[:m]
     around = np.zeros(m, np.int64)
     for n in range(m):
         for i in range(27):

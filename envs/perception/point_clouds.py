@@ -127,7 +127,7 @@ def one_per_cell(points: np.ndarray, cell: float = CELL) -> np.ndarray:
     """
     kind = points.dtype if points.dtype in (np.float32, np.float64) else np.float64
     numbers = np.require(points, kind, _AS_COMPILED)
-    return points[first_in_cells(numbers, numbers.dtype.type(cell))[0]]
+    return points[first_in_cells(numbers, numbers.dtype.type(cell), False)[0]]
 
 
 def without_known(
@@ -182,7 +182,7 @@ def without_outliers(points: np.ndarray, cell: float, min_points: int) -> np.nda
 
     Their cube with edges of `cell` (m) and the 26 around it have at least `min_points`.
     """
-    _, cubes, around = first_in_cells(points, np.float32(cell))
+    _, cubes, around = first_in_cells(points, np.float32(cell), True)
     return points[(around >= min_points)[cubes]]
 
 
