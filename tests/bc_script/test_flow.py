@@ -17,9 +17,11 @@ from roboarm_nmp.envs.perception.geometry_source import observed_checker
 from roboarm_nmp.envs.perception.point_clouds import observed_points
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.evaluation.evaluate import evaluate
+from roboarm_nmp.evaluation.rollout import rollout
 from roboarm_nmp.networks.network_file import load_network
 from roboarm_nmp.policies.generative import PathsOfNetwork, find_path
 from roboarm_nmp.policies.registry import PolicyError, make_policy
+from roboarm_nmp.policies.safety_filter import SafetyFilter
 
 HARD = "random_boxes_hard"
 
@@ -113,6 +115,23 @@ def test_killed_and_resumed_run_is_bit_identical_and_evaluated_as_validated(run,
     assert 0.0 <= result["verified_rate"] <= 1.0 and "search_rate" not in result
     searched = evaluate(run, HARD, split="validation", num_queries=2, search=True)
     assert searched["verified_rate"] == 1.0 and searched["search_rate"] <= 1.0
+    careful = evaluate(run, HARD, split="validation", num_queries=2, unknown="occupied")
+    assert careful["unknown"] == "occupied"
+    assert careful["verified_rate"] <= result["verified_rate"]
+
+
+def test_own_filter_leaves_a_verified_path_as_it_is_where_nothing_moves(run):
+    env = envs.make(HARD, goal_type="combined", geometry_source="point_cloud", link_distances=True)
+    query = load_queries(HARD, "validation")[0]
+    actions = {}
+    for name, safety_filter in (("own", None), ("none", False), ("another", SafetyFilter(0.05))):
+        act, verified, _ = make_policy(
+            run / "policy.onnx", env, search=True, safety_filter=safety_filter
+        )(0, query)
+        assert verified
+        actions[name] = rollout(env, query, act).actions
+    assert np.array_equal(actions["own"], actions["none"])
+    assert not np.array_equal(actions["own"], actions["another"])
 
 
 @pytest.mark.parametrize(
