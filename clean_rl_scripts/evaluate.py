@@ -96,8 +96,9 @@ class Args:
     search: bool = False
     """of a policy that draws paths: search for one where none of its own can be verified"""
     unknown: Literal["free", "occupied"] | None = None
-    """of a policy that draws paths: what space counts as that no sensor sees; by default occupied,
-    and free only where no path is found otherwise"""
+    """what space counts as that no sensor sees, for `planner` with the geometry source
+    `point_cloud` (by default free), and for a policy that draws paths (by default occupied, and
+    free only where it finds no path otherwise)"""
     lookahead: flags.NonNegativeFloat = 0.0
     """s: the safety filter takes distances as they will be after this time, if obstacles continue
     to approach as they do now"""

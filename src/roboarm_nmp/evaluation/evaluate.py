@@ -103,8 +103,9 @@ class EvaluationOptions:
             (`policies.replanning.ReplanWhenStuck`), among the geometry source's obstacles.
         search: a policy that draws paths searches for one where it can verify none
             (`policies.generative`).
-        unknown: what space counts as that no sensor sees, `free` or `occupied`, for a policy that
-            draws paths; None: occupied, and free only where it finds no path otherwise.
+        unknown: what space counts as that no sensor sees: `free` or `occupied`. None: for a policy
+            that draws paths, occupied, and free only where it finds no path otherwise; for
+            `planner` with the geometry source `point_cloud`, free.
         observe_every: steps from one observation of the scene to the next; None: static scenes are
             observed once (`envs.wrappers.ObservedSceneWrapper`).
         sensor_noise: a `envs.perception.noise.SensorNoise`; None for none.

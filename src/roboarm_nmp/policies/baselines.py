@@ -38,6 +38,7 @@ from roboarm_nmp.policies.pose_goals import goal_configuration, observed_at_star
 
 if TYPE_CHECKING:  # Numba takes a while to import
     from roboarm_nmp.envs.collision.checker import CollisionChecker
+    from roboarm_nmp.envs.perception.geometry_source import Unknown
     from roboarm_nmp.policies.replanning import Replanning
 
 SPACE_TIME = "space-time"
@@ -62,17 +63,24 @@ def make_baseline(
     tries: int,
     time_limit: float,
     geometry_source: str | Path,
+    unknown: "Unknown | None" = None,
 ) -> BeginEpisode:
     """A baseline in an environment.
 
     Args:
         name: one of `BASELINES`.
-        env, seed, tries, time_limit, geometry_source: see `policies.registry.make_policy`.
+        env, seed, tries, time_limit, geometry_source, unknown: see
+            `policies.registry.make_policy`.
 
     Raises:
-        ValueError: the environment's actions are not displacements, or there is no such geometry
-            source.
+        ValueError: the environment's actions are not displacements, there is no such geometry
+            source, or unseen space is not occupied for this baseline.
     """
+    if unknown == "occupied" and (name != "planner" or geometry_source != "point_cloud"):
+        raise ValueError(
+            "unknown='occupied' is for policies that draw paths, and for planner with "
+            "geometry_source='point_cloud'"
+        )
     robot = env.robot
     if name == "random":
 
@@ -101,7 +109,7 @@ def make_baseline(
     if name == REPLANNING:
         begin_replanning = make_replanning(env, seed, source)
         return lambda number, query: EpisodePolicy(begin_replanning(number, query))
-    return _planner(env, seed, time_limit, source)
+    return _planner(env, seed, time_limit, source, unknown == "occupied")
 
 
 def _goal(env, query, checker=None):
@@ -178,7 +186,14 @@ def make_replanning(
     return begin
 
 
-def _planner(env: RoboArmEnv, seed: int, time_limit: float, geometry_source: GeometrySource):
+def _planner(
+    env: RoboArmEnv,
+    seed: int,
+    time_limit: float,
+    geometry_source: GeometrySource,
+    unknown_is_occupied: bool,
+):
+    from roboarm_nmp.envs.perception.geometry_source import cautious_checker
     from roboarm_nmp.planning.planner import Planner, PlanningError
 
     planner_of_scenes = Planner(env, geometry_source=geometry_source)
@@ -194,6 +209,10 @@ def _planner(env: RoboArmEnv, seed: int, time_limit: float, geometry_source: Geo
         if env.goal_type == "pose":
             goal = None
             goal_pose = env.robot.end_effector_pose(query.goal)
+        if unknown_is_occupied:
+            ends = [query.start] if goal is None else [query.start, goal]
+            checker = cautious_checker(observed, np.clip(env.robot.normalise(ends), -1.0, 1.0))
+            planner = Planner(env, geometry_source=lambda _: checker)
         try:
             path = planner.plan(
                 query.start,

@@ -212,8 +212,9 @@ def make_policy(
             (`policies.replanning.ReplanWhenStuck`); a safety filter then makes no escapes.
         search: a policy that draws paths searches for one where it can verify none
             (`policies.generative`).
-        unknown: what space counts as that no sensor sees, `free` or `occupied`, for a policy that
-            draws paths; None: occupied, and free only where it finds no path otherwise.
+        unknown: what space counts as that no sensor sees: `free` or `occupied`. None: for a policy
+            that draws paths, occupied, and free only where it finds no path otherwise; for
+            `planner` with the geometry source `point_cloud`, free.
 
     Raises:
         PolicyError: the policy cannot act in this environment.
@@ -225,7 +226,9 @@ def make_policy(
         begin = lambda number, query: EpisodePolicy(policy)  # noqa: E731
     elif policy in BASELINES:
         try:
-            begin = make_baseline(str(policy), env, seed, tries, time_limit, geometry_source)
+            begin = make_baseline(
+                str(policy), env, seed, tries, time_limit, geometry_source, unknown
+            )
         except ValueError as error:
             raise PolicyError(str(error)) from error
     else:
