@@ -22,6 +22,7 @@ from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.point_clouds import (
     FINE_POINT_RADIUS,
     POINT_CLOUD,
+    dense_observed_points,
     fine_observed_points,
     observed_points,
     without_known,
@@ -96,8 +97,17 @@ def fine_observed_checker(scene: Scene) -> CollisionChecker:
     return _checker_of_points(scene, fine_observed_points(scene), radius)
 
 
+@functools.lru_cache(CACHED_FINE_CHECKERS)
+def dense_observed_checker(scene: Scene) -> CollisionChecker:
+    """As `fine_observed_checker`, of sensors with more rays: to verify a whole path."""
+    if isinstance(scene, ObservedScene):
+        return observed_checker(scene)
+    radius = scale_of(scene.robot) * FINE_POINT_RADIUS
+    return _checker_of_points(scene, dense_observed_points(scene), radius)
+
+
 def cautious_checker(scene: Scene, states: np.ndarray) -> CollisionChecker:
-    """As `fine_observed_checker`, but space that no sensor sees is occupied, too.
+    """As `dense_observed_checker`, but space that no sensor sees is occupied, too.
 
     Args:
         scene: the `Scene`.
@@ -105,9 +115,9 @@ def cautious_checker(scene: Scene, states: np.ndarray) -> CollisionChecker:
     """
     points = unseen_points(scene, states)
     if not len(points):
-        return fine_observed_checker(scene)
+        return dense_observed_checker(scene)
     radius = scale_of(scene.robot) * FINE_POINT_RADIUS
-    points = np.concatenate([fine_observed_points(scene), points])
+    points = np.concatenate([dense_observed_points(scene), points])
     return _checker_of_points(scene, points, radius)
 
 

@@ -19,7 +19,7 @@ from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.evaluation.evaluate import evaluate
 from roboarm_nmp.evaluation.rollout import rollout
 from roboarm_nmp.networks.network_file import load_network
-from roboarm_nmp.policies.generative import PathsOfNetwork, find_path
+from roboarm_nmp.policies.generative import PathsOfNetwork, draw_path, search_path
 from roboarm_nmp.policies.registry import PolicyError, make_policy
 from roboarm_nmp.policies.safety_filter import SafetyFilter
 
@@ -75,15 +75,18 @@ def test_paths_are_free_in_the_cloud_and_repeatable(run):
         found = []
         for _ in range(2):
             paths.begin(query.scene, *ends.astype(np.float32))
-            found.append(find_path(paths, checker, ends, np.random.default_rng(i), search=True))
-        (path, is_verified, searched), (again, *_) = found
-        assert np.array_equal(path, again) and is_verified
+            path, is_verified = draw_path(paths, checker, ends, np.random.default_rng(i))
+            if not is_verified:
+                path = search_path(checker, ends, np.random.default_rng(i))
+            found.append(path)
+        path, again = found
+        assert np.array_equal(path, again)
         assert np.abs(path[[0, -1]] - ends).max() < 1e-6
         # (The cloud's balls may touch the arm at start and goal already.)
         room = np.minimum(checker.signed_distances(ends).distance.min(-1) - 1e-5, 0.0)
         near = (ends, room, 0.05)
         assert checker.is_motion_free(path[:-1], path[1:], endpoint_margins=near).all()
-        verified += not searched
+        verified += is_verified
     assert verified >= 2  # without training, too: draws are repaired
 
 
@@ -97,10 +100,10 @@ def test_what_cannot_be_verified_is_followed_anyway_and_searched_for_if_allowed(
     ends = np.clip(PANDA.normalise([query.start, query.goal]), -1.0, 1.0)
     checker = Blocked(query.scene)
     paths.begin(query.scene, *ends.astype(np.float32))
-    path, verified, searched = find_path(paths, checker, ends, np.random.default_rng(0))
-    assert not verified and not searched and np.abs(path[[0, -1]] - ends).max() < 1e-6
-    path, verified, searched = find_path(paths, checker, ends, np.random.default_rng(0), True)
-    assert verified and searched and len(path) >= 2
+    path, verified = draw_path(paths, checker, ends, np.random.default_rng(0))
+    assert not verified and np.abs(path[[0, -1]] - ends).max() < 1e-6
+    path = search_path(checker, ends, np.random.default_rng(0))
+    assert path is not None and len(path) >= 2
 
 
 def test_killed_and_resumed_run_is_bit_identical_and_evaluated_as_validated(run, tmp_path):

@@ -247,6 +247,10 @@ def _space_time(env: RoboArmEnv, seed: int, time_limit: float):
 
 def follow_path(path: np.ndarray, robot: Robot) -> Policy:
     """One sub-goal per step along a path (k, n), rad; at its end the goal, repeatedly."""
-    targets = subgoals(path, robot)[1:]
-    remaining = itertools.chain(targets, itertools.repeat(targets[-1]))
+    return follow_subgoals(subgoals(path, robot), robot)
+
+
+def follow_subgoals(targets: np.ndarray, robot: Robot) -> Policy:
+    """One of the sub-goals (m, n), normalised, per step, from the second on, then the last."""
+    remaining = itertools.chain(targets[1:], itertools.repeat(targets[-1]))
     return lambda observation: next(remaining) - observation["observation"][: robot.num_joints]

@@ -23,12 +23,13 @@ from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.geometry_source import (
     Unknown,
     cautious_checker,
-    fine_observed_checker,
+    dense_observed_checker,
 )
 from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, observed_points
+from roboarm_nmp.envs.subgoals import subgoals
 from roboarm_nmp.networks.network_file import Network
 from roboarm_nmp.networks.untrusted import NetworkError
-from roboarm_nmp.policies.baselines import follow_path
+from roboarm_nmp.policies.baselines import follow_subgoals
 from roboarm_nmp.policies.policy import EpisodePolicy
 from roboarm_nmp.policies.pose_goals import observed_at_start
 
@@ -45,6 +46,7 @@ MOST_KNOTS = 1_000  # of a path in a file
 MOST_CHECKED = 40  # times that motions of assembled paths are checked
 CHORDS = 40  # straight motions that are tried to shorten the chosen path
 SEARCH_CHECKS = 200_000  # of a search, in each margin
+SLOW_STEPS = 6  # at start and goal: about as far as margins are smaller there
 
 
 class Generative:
@@ -81,20 +83,22 @@ class Generative:
         rng = np.random.default_rng([self._seed, number])
         ends = np.clip(self._robot.normalise([query.start, query.goal]), -1.0, 1.0)
         draw = self._paths.begin(scene, *ends.astype(np.float32))
-        searched = False
-        for checker in self._checkers(scene, ends):
-            path, verified, by_search = find_path(draw, checker, ends, rng, self._search)
-            searched |= by_search
-            if verified:
-                break
-        act = follow_path(self._robot.denormalise(path), self._robot)
-        return EpisodePolicy(act, verified, searched)
-
-    def _checkers(self, scene, ends):
+        checkers, path, verified, searched = [], ends, False, False
         if self._unknown != "free":
-            yield cautious_checker(scene, ends)
-        if self._unknown != "occupied":
-            yield fine_observed_checker(scene)
+            checkers.append(cautious_checker(scene, ends))
+            path, verified = draw_path(draw, checkers[0], ends, rng)
+        if not verified and self._unknown != "occupied":
+            checkers.append(dense_observed_checker(scene))
+            path, verified = draw_path(draw, checkers[-1], ends, rng)
+        if not verified and self._search:
+            searched = True
+            for checker in checkers:
+                found = search_path(checker, ends, rng)
+                if found is not None:
+                    path, verified = found, True
+                    break
+        act = _follow_gently(self._robot.denormalise(path), self._robot)
+        return EpisodePolicy(act, verified, searched)
 
 
 class PathsOfNetwork:
@@ -244,27 +248,21 @@ def _form_of_paths(network, field):
     return curves, every, line, numbers // 3
 
 
-def find_path(
-    paths: PathsOfNetwork,
-    checker: CollisionChecker,
-    ends: np.ndarray,
-    rng: np.random.Generator,
-    search: bool = False,
-) -> tuple[np.ndarray, bool, bool]:
-    """A path from start to goal, normalised (k, n); whether it is verified; whether searched for.
+def draw_path(
+    paths: PathsOfNetwork, checker: CollisionChecker, ends: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, bool]:
+    """A path from start to goal, normalised (k, n), and whether it is verified.
 
     Args:
         paths: which has begun with the query.
         checker: of what is observed.
         ends: start and goal (2, n), normalised.
         rng: a NumPy Generator.
-        search: see `Generative`.
     """
     start, goal = ends
-    room = checker.signed_distances(ends).distance.min(-1) - 1e-5
-    near = [(ends, np.minimum(room, margin), MARGIN_GROWTH) for margin in MARGINS]
+    near = _margins_near(checker, ends)
     if checker.is_motion_free(start, goal, MARGINS[0], endpoint_margins=near[0]):
-        return ends, True, False
+        return ends, True
     drawn = np.empty((0, *paths.curves.shape[:1], len(ends[0])), np.float32)
     for number in range(ROUNDS):
         fresh, steps = DRAWS, STEPS
@@ -280,24 +278,45 @@ def find_path(
             drawn = np.concatenate([drawn, some])
             found = _shortest_free(paths, checker, paths.knots(some), MARGINS[0], near[0], rng)
             if found is not None:
-                return found, True, False
+                return found, True
     knots = paths.knots(drawn)
     for margin, ends_near in zip(MARGINS, near, strict=True):
         found = _assembled(paths, checker, knots[-2 * DRAWS :], margin, ends_near)
         if found is not None:
             found = _finished(checker, found, margin, ends_near, rng)
         if found is not None:
-            return found, True, False
-    if search:
-        for margin, ends_near in zip(MARGINS, near, strict=True):
-            found, _ = checker.find_path(
-                start, goal, rng, margin, endpoint_margins=ends_near, max_checks=SEARCH_CHECKS
-            )
-            if found is not None:
-                return found, True, True
+            return found, True
     knots = knots[np.argsort(paths.lacking(drawn), kind="stable")[:DRAWS]]
     free = checker.is_motion_free(knots[:, :-1], knots[:, 1:], endpoint_margins=near[-1])
-    return knots[free.sum(1).argmax()], False, search
+    return knots[free.sum(1).argmax()], False
+
+
+def search_path(
+    checker: CollisionChecker, ends: np.ndarray, rng: np.random.Generator
+) -> np.ndarray | None:
+    """As `draw_path`, a path that is searched for, and verified; None if there is none."""
+    for margin, near in zip(MARGINS, _margins_near(checker, ends), strict=True):
+        path, _ = checker.find_path(
+            *ends, rng, margin, endpoint_margins=near, max_checks=SEARCH_CHECKS
+        )
+        if path is not None:
+            return path
+    return None
+
+
+def _margins_near(checker, ends):
+    """For each of `MARGINS`, the smaller margins near start and goal, where there is less room."""
+    room = checker.signed_distances(ends).distance.min(-1) - 1e-5
+    return [(ends, np.minimum(room, margin), MARGIN_GROWTH) for margin in MARGINS]
+
+
+def _follow_gently(path, robot):
+    """As `follow_path`, but with half as long steps near start and goal, which may be tight."""
+    targets = subgoals(path, robot)
+    last = len(targets) - 1
+    slow = np.unique([*range(min(SLOW_STEPS, last)), *range(max(last - SLOW_STEPS, 0), last)])
+    middles = (targets[slow] + targets[slow + 1]) / 2
+    return follow_subgoals(np.insert(targets, slow + 1, middles, axis=0), robot)
 
 
 def _lengths(knots):
