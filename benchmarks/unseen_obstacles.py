@@ -24,7 +24,7 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from baselines import TABULATED
+from baselines import STATIC_TASKS, TABULATED
 from markdown_tables import NOTHING, interval, share, table, write, write_cells
 
 from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths
@@ -50,6 +50,7 @@ CELLS = {
     "go-to-goal, filter, point_cloud": [*STRAIGHT, *POINT_CLOUD],
     "go-to-goal, filter, ground_truth, no escape": [*STRAIGHT, *GROUND_TRUTH, "--no-escape"],
     "go-to-goal, filter, ground_truth": [*STRAIGHT, *GROUND_TRUTH],
+    "go-to-goal, filter and approach, point_cloud": [*STRAIGHT, *POINT_CLOUD, "--approach"],
     "plan from the point cloud": [*PLANNER, "--geometry-source", "point_cloud"],
     "plan from the decoded cloud, field": [*PLANNER, "--geometry-source", "field"],
     "RRT-Connect": PLANNER,
@@ -415,7 +416,7 @@ def _mark(result):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--only", nargs="+", choices=list(TABULATED), metavar="TASK")
+    parser.add_argument("--only", nargs="+", choices=list(STATIC_TASKS), metavar="TASK")
     parser.add_argument("--cells", nargs="+", choices=list(CELLS), metavar="CELL")
     parser.add_argument("--num", type=int, default=1000, help="queries of a cell")
     parser.add_argument("--workers", type=int, default=1)
