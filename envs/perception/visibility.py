@@ -40,15 +40,15 @@ def are_seen(scene: Scene, points: np.ndarray) -> np.ndarray:
         view = view_of(sensor, sensor.size)
         mark_seen(points, view, depth, TOLERANCE, seen)
     hidden = ~seen
-    seen[hidden] = are_near_arm(points[hidden], scene.robot, [_observed(scene)], ARM_DISTANCE)
+    seen[hidden] = are_near_arm(points[hidden], scene.robot, _observed(scene), ARM_DISTANCE)
     return seen
 
 
 def _observed(scene):
-    """The normalised configuration of the arm when a scene was observed."""
+    """The normalised configuration of the arm when a scene was observed: (1, n)."""
     of_observation = isinstance(scene, SceneObservation)
     configuration = scene.configuration if of_observation else scene.robot.observed_pose
-    return np.clip(scene.robot.normalise(configuration), -1.0, 1.0)
+    return np.clip(scene.robot.normalise([configuration]), -1.0, 1.0)
 
 
 def unseen_points(scene: Scene, states: np.ndarray) -> np.ndarray:

@@ -295,9 +295,10 @@ def search_path(
     checker: CollisionChecker, ends: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray | None:
     """As `draw_path`, a path that is searched for, and verified; None if there is none."""
+    start, goal = ends
     for margin, near in zip(MARGINS, _margins_near(checker, ends), strict=True):
         path, _ = checker.find_path(
-            *ends, rng, margin, endpoint_margins=near, max_checks=SEARCH_CHECKS
+            start, goal, rng, margin, endpoint_margins=near, max_checks=SEARCH_CHECKS
         )
         if path is not None:
             return path
