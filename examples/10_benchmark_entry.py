@@ -1,54 +1,38 @@
-"""Enter a method into the benchmark: a planner that searches among observed points.
+"""An entry to the benchmark: a program that searches for a path among observed points.
 
-    python examples/10_benchmark_entry.py --output entry
+    roboarm benchmark run --program "python examples/10_benchmark_entry.py" --searches \\
+        --observes point_cloud --tasks random_boxes_hard --num-queries 50 --output entry
     roboarm benchmark verify entry
 
-The second command replays every episode and compares its numbers. docs/benchmark/enter.md has the
-rules; in examples/benchmark there are more entries.
+The second command replays every episode and compares its numbers. The program reads a problem per
+line, as JSON, and answers each with a path, so yours may be in any language. The rules are in
+docs/benchmark/enter.md; `examples/benchmark` has entries that act step by step, or are functions.
 """
 
-import argparse
+import json
 import sys
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 
 import roboarm_nmp
 from roboarm_nmp.envs.scenes.primitives import ObservedScene
-from roboarm_nmp.evaluation.benchmark import main as benchmark
-from roboarm_nmp.evaluation.entrants import Problem
 from roboarm_nmp.planning.planner import Planner, PlanningError
 
 
-@cache
-def planner() -> Planner:
-    """One planner for all episodes of a process."""
-    return Planner(roboarm_nmp.make("no_obstacles"), max_checks=100_000)
-
-
-def begin(problem: Problem) -> np.ndarray | None:
-    """A path (k, 7), rad, which is then followed; None to give up."""
-    assert problem.points is not None  # --observes point_cloud
-    scene = ObservedScene(robot=problem.robot, points=problem.points)
-    start, goal = problem.start.astype(np.float32), problem.goal.astype(np.float32)
-    try:
-        return planner().plan(start, goal, scene, seed=problem.seed, time_limit=60.0)
-    except PlanningError:
-        return None
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--output", default="entry")
-    parser.add_argument("--task", default="random_boxes_hard")
-    parser.add_argument("--num-queries", default="50")
-    args = parser.parse_args()
-    sys.path.insert(0, str(Path(__file__).parent))
-    method = ["--function", f"{Path(__file__).stem}:begin", "--observes", "point_cloud"]
-    run = ["--searches", "--tasks", args.task, "--num-queries", args.num_queries, "--workers", "1"]
-    return benchmark(["run", *method, *run, "--output", args.output])
+def main() -> None:
+    planner = Planner(roboarm_nmp.make("no_obstacles"), max_checks=100_000)
+    for line in sys.stdin:
+        problem = json.loads(line)
+        scene = ObservedScene(points=np.array(problem["points"], np.float32))  # (n, 3), m
+        start = np.array(problem["start"], np.float32)  # (7,), rad
+        goal = np.array(problem["goal"], np.float32)
+        try:
+            path = planner.plan(start, goal, scene, seed=problem["seed"], time_limit=60.0)
+            answer = path.tolist()  # (k, 7), rad
+        except (PlanningError, ValueError):  # no path, or a start or goal that touches a point
+            answer = None
+        print(json.dumps({"path": answer}), flush=True)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

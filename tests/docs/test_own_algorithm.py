@@ -2,7 +2,6 @@
 
 import json
 import re
-import subprocess
 
 from paths import ROOT
 from trainers import PATHS, TINIER, run_here, succeeds_here
@@ -22,13 +21,9 @@ def test_excerpts_of_the_walk_stand_in_the_trainer():
 def test_redq_diff_applies_and_trains_resumes_and_is_evaluated(tmp_path):
     (diff,) = re.findall(r"```diff\n(.*?)```", PAGE, re.DOTALL)
     assert len(re.findall(r"^\+(?!\+\+)", diff, re.MULTILINE)) <= 20
+    run_here(ROOT / "examples" / "07_own_algorithm.py", "--folder", tmp_path, *TINIER.split())
     script = tmp_path / "clean_rl_scripts" / "redq_her_mp.py"
-    script.parent.mkdir()
-    script.write_text(SAC)
-    subprocess.run(["git", "apply"], input=diff, text=True, cwd=tmp_path, check=True)
     assert "NUM_CRITICS = 5" in script.read_text()
-
-    run_here(script, "--runs-dir", tmp_path / "runs", *TINIER.split(), "--task", "wall")
     (run,) = (tmp_path / "runs").glob("wall__redq_her_mp__1__*")
     run_here(script, "--resume", run, "--total-timesteps", "600")
     assert json.loads((run / "result.json").read_text())["steps"] == 600
