@@ -179,13 +179,17 @@ def mlp(num_inputs, num_outputs, args, layer_norm=False):
 # END SHARED
 
 
-# SHARED: critics
+# SHARED: action scale
 def action_scale(args):
     """The policy's actions are in [-scale, scale]."""
     is_plain = args.plain_networks or args.action_mode == "subgoal"
     return 1.0 if is_plain else 2.0 * MAX_STEP
 
 
+# END SHARED
+
+
+# SHARED: critics
 class Critics(nn.Module):
     """Q1 and Q2."""
 
@@ -205,6 +209,7 @@ class Critics(nn.Module):
 # END SHARED
 
 
+# SHARED: stochastic policy
 LOG_STD_MIN, LOG_STD_MAX = -5, 2
 
 
@@ -233,6 +238,9 @@ class Actor(nn.Module):
     def forward(self, observation, achieved_goal, desired_goal, **_):
         """The deterministic action (N, n), for evaluation; policy.onnx contains this function."""
         return self.mean_action(self.features(observation, desired_goal))
+
+
+# END SHARED
 
 
 # ALGO LOGIC: replay buffer
@@ -369,6 +377,9 @@ class HerReplayBuffer:
 # END SHARED
 
 
+RULES = ("horizon", "stop_on_collision", "contact_cost")  # flags that are arguments of `make`
+
+
 # SHARED: environments
 def env_arguments(args):
     """The arguments of `roboarm_nmp.make` that a policy is saved with."""
@@ -378,7 +389,7 @@ def env_arguments(args):
 
 def make_env(args, demos=None) -> Any:
     """An environment; with demonstrations, its episodes are their queries."""
-    rules = {name: getattr(args, name) for name in ("horizon", "stop_on_collision", "contact_cost")}
+    rules = {name: getattr(args, name) for name in RULES}
     rules["goal_link_distances"] = False  # relabelled goals would not have them
     env = roboarm_nmp.make(args.task, **env_arguments(args), **rules)
     return env if demos is None else DemoQueriesWrapper(env, demos)

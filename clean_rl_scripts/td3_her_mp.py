@@ -178,13 +178,17 @@ def mlp(num_inputs, num_outputs, args, layer_norm=False):
 # END SHARED
 
 
-# SHARED: critics
+# SHARED: action scale
 def action_scale(args):
     """The policy's actions are in [-scale, scale]."""
     is_plain = args.plain_networks or args.action_mode == "subgoal"
     return 1.0 if is_plain else 2.0 * MAX_STEP
 
 
+# END SHARED
+
+
+# SHARED: critics
 class Critics(nn.Module):
     """Q1 and Q2."""
 
@@ -355,6 +359,9 @@ class HerReplayBuffer:
 # END SHARED
 
 
+RULES = ("horizon", "stop_on_collision", "contact_cost")  # flags that are arguments of `make`
+
+
 # SHARED: environments
 def env_arguments(args):
     """The arguments of `roboarm_nmp.make` that a policy is saved with."""
@@ -364,7 +371,7 @@ def env_arguments(args):
 
 def make_env(args, demos=None) -> Any:
     """An environment; with demonstrations, its episodes are their queries."""
-    rules = {name: getattr(args, name) for name in ("horizon", "stop_on_collision", "contact_cost")}
+    rules = {name: getattr(args, name) for name in RULES}
     rules["goal_link_distances"] = False  # relabelled goals would not have them
     env = roboarm_nmp.make(args.task, **env_arguments(args), **rules)
     return env if demos is None else DemoQueriesWrapper(env, demos)

@@ -15,6 +15,7 @@ from roboarm_nmp.utils.signals import end_with_one_line, flush_output
 TRAINERS = {
     "sac": ("clean_rl_scripts.sac_her_mp", "SAC with HER and demonstrations"),
     "td3": ("clean_rl_scripts.td3_her_mp", "TD3 with HER and demonstrations"),
+    "crl": ("clean_rl_scripts.crl_mp", "contrastive RL with hindsight and demonstrations"),
     "bc": ("bc_script.bc", "behavioural cloning of demonstrations"),
     "roadmap-bc": ("bc_script.roadmap_bc", "imitation of roadmap paths: policies for new scenes"),
     "flow": ("bc_script.flow", "flow matching of whole paths, verified before the arm moves"),

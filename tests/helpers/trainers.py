@@ -18,12 +18,13 @@ from roboarm_nmp import envs
 PATHS = {
     "sac_her_mp": ROOT / "clean_rl_scripts" / "sac_her_mp.py",
     "td3_her_mp": ROOT / "clean_rl_scripts" / "td3_her_mp.py",
+    "crl_mp": ROOT / "clean_rl_scripts" / "crl_mp.py",
     "bc": ROOT / "bc_script" / "bc.py",
     "roadmap_bc": ROOT / "bc_script" / "roadmap_bc.py",
     "flow": ROOT / "bc_script" / "flow.py",
 }
 # Trainers of policies in fixed scenes.
-TRAINERS = ("sac_her_mp", "td3_her_mp", "bc")
+TRAINERS = ("sac_her_mp", "td3_her_mp", "crl_mp", "bc")
 NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch sees no GPU here")
 GPU = pytest.param("cuda", marks=NO_GPU)  # a `--device`
 TINY = "--hidden-size 16 --batch-size 16 --updates-per-step 0.1 --learning-starts 200 --num-envs 3"
