@@ -32,7 +32,7 @@ def query(_, rng):
 TD3 = pytest.param("td3_her_mp", marks=pytest.mark.slow)  # it differs in its losses: test_updates
 
 
-@pytest.mark.parametrize("trainer", ["sac_her_mp", TD3])
+@pytest.mark.parametrize("trainer", ["sac_her_mp", TD3, "crl_mp"])
 def test_trainer_learns_to_reach_near_goals(trainer, tmp_path, monkeypatch):
     make = functools.partial(envs.make, ee_tolerance=0.05)  # m
     monkeypatch.setattr(roboarm_nmp, "make", make)
