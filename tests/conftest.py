@@ -1,4 +1,5 @@
 import contextlib
+import functools
 import importlib.util
 import os
 import random
@@ -10,11 +11,11 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from trainers import GPU
+from trainers import GPU, short_evaluations
 
 from roboarm_nmp.datasets.demonstrations import load_demos, write_demos
-from roboarm_nmp.evaluation import evaluate
 from roboarm_nmp.networks import export
+from roboarm_nmp.utils import workers
 
 # As many threads as a trainer has in a process of its own, whatever benchmarks set when they are
 # imported: results are compared bit for bit.
@@ -69,6 +70,22 @@ def seeded():
     torch.manual_seed(0)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def single_worker_is_this_process():
+    """Where one process is asked for, this one does its jobs: another takes seconds to start."""
+    run = workers.run
+
+    def run_jobs(make_worker, arguments, jobs, number, *more, **others):
+        if number == 1:
+            yield from map(make_worker(*arguments), jobs)
+        else:
+            yield from run(make_worker, arguments, jobs, number, *more, **others)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(workers, "run", run_jobs)
+        yield
+
+
 def structure_of(module):
     """All of a module but its parameters' values, as text."""
     parts = [(name, tuple(one.shape)) for name, one in module.named_parameters()]
@@ -83,6 +100,15 @@ def structure_of(module):
 EXPORTED = {}
 
 
+@functools.cache
+def tabulate_operators_once():
+    """PyTorch fills the same table of ONNX operators anew for every export, in a second."""
+    with contextlib.suppress(ImportError):  # in another version of PyTorch
+        from torch.onnx._internal.exporter._registration import ONNXRegistry
+
+        ONNXRegistry.from_torchlib = staticmethod(functools.cache(ONNXRegistry.from_torchlib))
+
+
 @pytest.fixture(scope="module", autouse=True)
 def exports_once():
     """PyTorch takes seconds to export a network, so those that differ in weights alone share one.
@@ -95,6 +121,7 @@ def exports_once():
         shapes = [(name, tuple(one.shape), one.dtype) for name, one in inputs.items()]
         structure = repr((structure_of(module), shapes, *options))
         if structure not in EXPORTED:
+            tabulate_operators_once()
             EXPORTED[structure] = export_module(module, inputs, *options)
         model, weights = onnx.ModelProto(), dict(module.named_parameters())
         model.CopyFrom(EXPORTED[structure])
@@ -152,16 +179,10 @@ def few_demos(tmp_path_factory):
 
 
 @pytest.fixture
-def short_episodes(monkeypatch):
-    """Evaluations are over sooner: their episodes have at most 30 steps."""
-    make = evaluate._Job.make
-
-    def make_short(job, **options):
-        env, begin = make(job, **options)
-        env.unwrapped.horizon = 30
-        return env, begin
-
-    monkeypatch.setattr(evaluate._Job, "make", make_short)
+def short_episodes():
+    """Evaluations are over sooner."""
+    with short_evaluations():
+        yield
 
 
 @pytest.fixture

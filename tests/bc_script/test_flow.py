@@ -7,7 +7,7 @@ import onnx
 import pytest
 import torch
 from scipy.spatial import cKDTree
-from trainers import PATHS, killed_run, run_here, run_script
+from trainers import PATHS, command, run_here, run_script, short_evaluations, stopped_run
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.queries import load_queries
@@ -28,7 +28,8 @@ HARD = "random_boxes_hard"
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    return run_script("flow", tmp_path_factory.mktemp("flow"), "--task", HARD)
+    with short_evaluations():
+        return run_script("flow", tmp_path_factory.mktemp("flow"), "--task", HARD)
 
 
 def test_field_has_the_distances_of_points_and_table_and_their_gradient():
@@ -106,10 +107,12 @@ def test_what_cannot_be_verified_is_followed_anyway_and_searched_for_if_allowed(
     assert path is not None and len(path) >= 2
 
 
-def test_killed_and_resumed_run_is_bit_identical_and_evaluated_as_validated(run, tmp_path):
-    killed = killed_run("flow", tmp_path / "killed", "--task", HARD)
-    run_here(PATHS["flow"], "--resume", killed)
-    one, other = (torch.load(each / "checkpoint.pt", weights_only=True) for each in (run, killed))
+def test_stopped_and_resumed_run_is_bit_identical_and_evaluated_as_validated(
+    run, tmp_path, short_episodes
+):
+    stopped = stopped_run(tmp_path, *command("flow", tmp_path, "--task", HARD)[1:])
+    run_here(PATHS["flow"], "--resume", stopped)
+    one, other = (torch.load(each / "checkpoint.pt", weights_only=True) for each in (run, stopped))
     for name in ("network", "average"):
         assert all(torch.equal(one[name][key], other[name][key]) for key in one[name])
     best = json.loads((run / "result.json").read_text())["validation_success_rate"]

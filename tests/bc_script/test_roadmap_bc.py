@@ -2,7 +2,6 @@
 
 import copy
 import json
-from pathlib import Path
 
 import numpy as np
 import onnx
@@ -10,14 +9,22 @@ import pytest
 import torch
 from one_type import OneType
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from trainers import PATHS, killed_run, load, refusal, run_here, run_script
+from trainers import (
+    PATHS,
+    command,
+    load,
+    refusal,
+    run_here,
+    run_script,
+    short_evaluations,
+    stopped_run,
+)
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths, shard_bytes
 from roboarm_nmp.datasets.shards import shard_path
 from roboarm_nmp.demo_generation.roadmap_examples import RoadmapExamples
 from roboarm_nmp.demo_generation.roadmaps import Roadmap
-from roboarm_nmp.envs.perception.encoders import PRETRAINED
 from roboarm_nmp.envs.perception.geometry_source import ground_truth_checker
 from roboarm_nmp.evaluation.evaluate import evaluate
 from roboarm_nmp.networks.export import read_weights
@@ -46,15 +53,11 @@ def folder(tmp_path_factory):
     return write_paths(tmp_path_factory.mktemp("paths"), scenes, [paths[0], [], paths[2]])
 
 
-@pytest.fixture(scope="module", params=["point_cloud", "vqvae"])
-def setting(request, folder, tmp_path_factory):
+@pytest.fixture(scope="module")
+def setting(folder):
     """An untrained policy, its environment, and a batch of examples in two scenes."""
-    encoder = request.param
-    if encoder == "vqvae":  # a copy: encoded scenes are stored beside it
-        encoder = str(tmp_path_factory.mktemp("encoder") / "vqvae.onnx")
-        Path(encoder).write_bytes((PRETRAINED / "vqvae.onnx").read_bytes())
     source = {"geometry_source": "ground_truth", "link_distances": True}
-    env = envs.make(HARD, goal_type="combined", encoder=encoder, **source)
+    env = envs.make(HARD, goal_type="combined", encoder="point_cloud", **source)
     paths = load_roadmap_paths(folder)
     args = roadmap_bc.Args(token_width=16, hidden_size=32, bf16=False)
     make_examples = RoadmapExamples(HARD, paths, env.encoder, ground_truth_checker, 1, count=1536)
@@ -106,9 +109,7 @@ def test_initial_action_is_straight_to_the_goal(setting):
 
 
 def test_order_of_tokens_and_rows_of_zeros_do_not_matter(setting):
-    actor, env, batch = setting
-    if env.encoder.token_size == env.encoder.size:
-        pytest.skip("a latent code is a single token")
+    actor, _, batch = setting
     inputs = inputs_of(batch)
     direction, length = actor.outputs(**inputs)
     tokens = inputs["observation"][:, 10:].unflatten(1, (-1, actor.token_size))
@@ -166,7 +167,16 @@ def test_pool_has_the_examples_of_the_last_scenes():
 # --- Runs
 
 
-def test_killed_and_resumed_run_is_bit_identical_and_evaluated_as_validated(tmp_path, folder):
+@pytest.fixture
+def rather_short_episodes():
+    """Evaluations are over sooner, but late enough to reach goals."""
+    with short_evaluations(250):
+        yield
+
+
+def test_stopped_and_resumed_run_is_bit_identical_and_evaluated_as_validated(
+    tmp_path, folder, rather_short_episodes
+):
     flags = ["--paths", str(folder), "--encoder", "point_cloud", "--num-points", "8"]
     flags += ["--safety-margin", "0.012"]
     whole = run_script("roadmap_bc", tmp_path / "whole", *flags)
@@ -175,9 +185,10 @@ def test_killed_and_resumed_run_is_bit_identical_and_evaluated_as_validated(tmp_
     for tag in ("success_rate", "collision_free_success_rate", "success_rate_without_filter"):
         assert [event.step for event in events.Scalars(f"eval/{tag}")] == [20, 40]
 
-    killed = killed_run("roadmap_bc", tmp_path / "killed", *flags)
-    run_here(PATHS["roadmap_bc"], "--resume", killed)
-    one, other = (torch.load(run / "checkpoint.pt", weights_only=True) for run in (whole, killed))
+    parts = tmp_path / "parts"
+    stopped = stopped_run(parts, *command("roadmap_bc", parts, *flags)[1:])
+    run_here(PATHS["roadmap_bc"], "--resume", stopped)
+    one, other = (torch.load(run / "checkpoint.pt", weights_only=True) for run in (whole, stopped))
     for name in ("actor", "actor_average"):
         assert one[name].keys() == other[name].keys() and one[name]
         assert all(torch.equal(one[name][key], other[name][key]) for key in one[name])
@@ -226,9 +237,7 @@ def test_initial_policy_that_does_not_fit_is_rejected(tmp_path, folder, policy, 
 
 def test_goal_poses_are_imitated_saved_and_evaluated(tmp_path, folder, short_episodes):
     flags = ["--paths", str(folder), "--goal-type", "pose", "--eval-queries", "1"]
-    run = run_script(
-        "roadmap_bc", tmp_path, *flags, "--encoder", "point_cloud", "--num-points", "8"
-    )
+    run = run_script("roadmap_bc", tmp_path, *flags, "--encoder", "vqvae")  # a single token
     assert json.loads((run / "result.json").read_text())["goal_type"] == "pose"
     path, arguments = find_policy(run)
     env = envs.make(HARD, **arguments)
@@ -256,9 +265,9 @@ def test_run_on_another_device(tmp_path, folder, another_device, short_episodes)
 
 
 def test_no_kernel_receives_two_dtypes(tmp_path, folder, short_episodes):
-    few = ["--total-updates", "4", "--eval-every", "4", "--eval-queries", "1"]
+    few = "--encoder oracle --bf16 True --total-updates 4 --eval-every 4 --eval-queries 1"
     with OneType():
-        run_script("roadmap_bc", tmp_path, "--paths", str(folder), "--bf16", "True", *few)
+        run_script("roadmap_bc", tmp_path, "--paths", str(folder), *few.split())
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from trainers import ONE_EVALUATION, PATHS, load, panda_env, run_here, run_script
 
 from roboarm_nmp import envs
-from roboarm_nmp.datasets.demonstrations import Demos, load_demos
+from roboarm_nmp.datasets.demonstrations import load_demos
 from roboarm_nmp.datasets.episodes import DemoQueriesWrapper, demo_transitions, transition
-from roboarm_nmp.datasets.format import QueryScenes
 from roboarm_nmp.demo_generation import collect
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.training import cuda_graphs
@@ -172,38 +171,9 @@ def test_updates_fall_due_evenly_after_learning_starts():
 # --- Demonstrations
 
 
-def hand_made_demos(number=3, steps=12, task="no_obstacles"):
-    """Straight motions of 0.02 per step, normalised; the arm would follow them without lag."""
-    rng = np.random.default_rng(0)
-    direction = rng.normal(size=(number, 7))
-    direction *= 0.02 / np.linalg.norm(direction, axis=1, keepdims=True)
-    first = rng.uniform(-0.5, 0.5, (number, 7))
-    states = first[:, None] + np.arange(steps + 1)[:, None] * direction[:, None]
-    actions = np.repeat(direction[:, None], steps + 1, axis=1)
-    actions[:, -1] = 0.0
-    ends = PANDA.denormalise(states[:, [0, -1]]).astype(np.float32)
-    return Demos(
-        task=task,
-        seed=0,
-        start=ends[:, 0],
-        goal=ends[:, 1],
-        scenes=QueryScenes(envs.TASKS[task].scene),
-        states=states.reshape(-1, 7).astype(np.float32),
-        actions=actions.reshape(-1, 7).astype(np.float32),
-        offsets=np.arange(number + 1) * (steps + 1),
-        plan=ends.reshape(-1, 7),
-        plan_offsets=np.arange(number + 1) * 2,
-        plan_seed=np.arange(number),
-        digest=np.zeros(number, np.uint32),
-        collided=np.zeros(number, bool),
-        made_by="a test",
-        parameters={},
-    )
-
-
 @pytest.mark.parametrize("goal_type", ["ee", "config", "combined"])
 def test_demonstration_as_transitions_by_hand(goal_type):
-    demo = hand_made_demos()[1]
+    demo = load_demos("no_obstacles")[1]
     env = envs.make("no_obstacles", goal_type=goal_type)
     episode = demo_transitions(demo, env)
     angles = PANDA.denormalise(demo.states.astype(np.float64))
@@ -213,7 +183,7 @@ def test_demonstration_as_transitions_by_hand(goal_type):
         reached = np.linalg.norm(demo.states - PANDA.normalise(demo.goal), axis=1) <= 0.05
     else:
         reached = np.linalg.norm(positions - goal_position, axis=1) <= 0.02
-    assert len(episode) == np.argmax(reached) < len(demo.actions)  # cut where the goal is reached
+    assert len(episode) == np.argmax(reached) <= len(demo.actions)  # cut where the goal is reached
     for t, entry in enumerate(episode):
         observation = np.concatenate([demo.states[t], positions[t]])
         np.testing.assert_allclose(entry["observation"], observation, atol=1e-6)
@@ -241,7 +211,10 @@ def demo_file(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("vector_env", [SyncVectorEnv, lambda makers, **_: async_envs(makers)])
+ASYNC = pytest.param(lambda makers, **_: async_envs(makers), marks=pytest.mark.slow, id="async")
+
+
+@pytest.mark.parametrize("vector_env", [SyncVectorEnv, ASYNC])
 def test_transitions_are_those_of_single_environments_and_failures_inject_demonstrations(
     tmp_path, demo_file, vector_env, monkeypatch, short_episodes
 ):

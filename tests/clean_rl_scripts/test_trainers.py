@@ -15,12 +15,13 @@ from trainers import (
     PATHS,
     TRAINERS,
     command,
-    killed_run,
     load,
     refusal,
     run_here,
     run_script,
     shared_blocks,
+    short_evaluations,
+    stopped_run,
 )
 
 from roboarm_nmp import envs
@@ -46,10 +47,11 @@ FINISHED = {
 
 @pytest.fixture(scope="module")
 def finished_runs(tmp_path_factory):
-    return {
-        name: run_script(name, tmp_path_factory.mktemp(name), *flags)
-        for name, flags in FINISHED.items()
-    }
+    with short_evaluations():
+        return {
+            name: run_script(name, tmp_path_factory.mktemp(name), *flags)
+            for name, flags in FINISHED.items()
+        }
 
 
 @pytest.fixture
@@ -112,7 +114,9 @@ def test_run_writes_result_policy_and_tensorboard_events(finished_run, trainer):
     assert "hyperparameters/text_summary" in events.Tags()["tensors"]
 
 
-def test_saved_policy_is_the_running_average_and_acts_without_the_script(finished_run, trainer):
+def test_saved_policy_is_the_running_average_and_acts_without_the_script(
+    finished_run, trainer, short_episodes
+):
     policy = load_network(finished_run / "policy.onnx")
     metadata = {"kind": "policy", "task": "no_obstacles", "script": trainer, "seed": 1}
     assert metadata.items() <= policy.metadata.items() and policy.metadata["step"] in (300, 600)
@@ -154,16 +158,17 @@ def assert_same_checkpoints(*folders):
 
 @pytest.mark.parametrize("device", ["cpu", GPU])
 @pytest.mark.parametrize("name", ["sac_her_mp", "crl_mp", "bc"])
-def test_killed_and_resumed_run_is_bit_identical_to_an_uninterrupted_one(
-    tmp_path, name, device, finished_runs
+def test_stopped_and_resumed_run_is_bit_identical_to_an_uninterrupted_one(
+    tmp_path, name, device, finished_runs, short_episodes
 ):
     flags, whole = [*FINISHED[name], "--device", device], finished_runs[name]
     if device != "cpu":
         whole = run_script(name, tmp_path / "whole", *flags)
-    killed = killed_run(name, tmp_path / "killed", *flags)
-    run_here(PATHS[name], "--resume", killed)
-    assert_same_checkpoints(whole, killed)
-    results = [json.loads((run / "result.json").read_text()) for run in (whole, killed)]
+    folder = tmp_path / "stopped"
+    stopped = stopped_run(folder, *command(name, folder, *flags)[1:])
+    run_here(PATHS[name], "--resume", stopped)
+    assert_same_checkpoints(whole, stopped)
+    results = [json.loads((run / "result.json").read_text()) for run in (whole, stopped)]
     assert results[0]["success_rate"] == results[1]["success_rate"]
 
 
@@ -179,7 +184,7 @@ def test_signal_between_evaluations_keeps_the_transitions_of_running_episodes(
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as end:
         patch.setattr(runs.Run, "advance", advance_and_signal)
-        run_script("sac_her_mp", tmp_path)
+        run_script("sac_her_mp", tmp_path, *FINISHED["sac_her_mp"])
     assert end.value.code == 143
     (run,) = tmp_path.iterdir()
     state = torch.load(run / "checkpoint.pt", weights_only=True)
@@ -189,7 +194,7 @@ def test_signal_between_evaluations_keeps_the_transitions_of_running_episodes(
 
 
 def test_evaluation_that_a_signal_ends_is_repeated_by_the_resumed_run(
-    tmp_path, monkeypatch, finished_runs
+    tmp_path, monkeypatch, finished_runs, short_episodes
 ):
     def interrupted_evaluation(*_, **__):
         os.kill(os.getpid(), signal.SIGTERM)

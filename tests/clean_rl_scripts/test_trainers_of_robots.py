@@ -29,7 +29,8 @@ SHORT = {
     "roadmap_bc": ["--encoder", "point_cloud", "--eval-every", "40"],
     "flow": ["--eval-every", "40"],
 }
-SHORT["td3_her_mp"] += ["--demo-prob", "1", "--bc-weight", "2"]
+SHORT["td3_her_mp"] += ["--demo-prob", "1", "--bc-weight", "2", "--learning-starts", "60"]
+SHORT["td3_her_mp"] += ["--eval-every", "150", "--total-timesteps", "150"]
 
 
 @pytest.fixture(scope="module")

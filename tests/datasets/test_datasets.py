@@ -74,17 +74,6 @@ def test_round_trip_is_exact(tmp_path):
     assert set(validate(path, "wall")) == {"test", "validation"}
 
 
-def test_file_made_again_by_two_workers_has_the_same_bytes(made, tmp_path):
-    again = tmp_path / "again.h5"
-    make_queries.make_queries(again, "wall", 0, 30, 10, num_workers=2, progress=False)
-    assert again.read_bytes() == made.read_bytes()
-
-
-def in_this_process(make_worker, arguments, jobs, *_, **__):
-    """As `workers.run`."""
-    yield from map(make_worker(*arguments), jobs)
-
-
 def test_interrupted_command_continues_to_the_same_bytes(made, tmp_path, monkeypatch):
     again = tmp_path / "again.h5"
     numbers = []
@@ -96,7 +85,6 @@ def test_interrupted_command_continues_to_the_same_bytes(made, tmp_path, monkeyp
         numbers.append(entry["index"])
         append(journal, entry)
 
-    monkeypatch.setattr(make_queries.workers, "run", in_this_process)
     monkeypatch.setattr(make_queries.Journal, "append", append_or_die)
     with pytest.raises(OSError, match="disk is full"):
         make_queries.make_queries(again, "wall", 0, 30, 10, progress=False)
@@ -289,22 +277,21 @@ def test_validate_command_names_bad_files(made, path, capsys):
     assert "truncated" in error and str(made) in output.out
 
 
-def test_make_queries_command_replaces_a_file_and_says_how_it_was_made(tmp_path):
+def test_command_replaces_a_file_with_two_workers_and_says_how_it_was_made(made, tmp_path):
     path = tmp_path / "wall.h5"
-    made_by = "roboarm queries --task wall --seed 5 --num-test 12 --num-validation 3"
+    made_by = "roboarm queries --task wall --seed 0 --num-test 30 --num-validation 10"
     path.write_bytes(b"old")
     command = [sys.executable, "-m", "roboarm_nmp", *made_by.split()[1:]]
-    command += ["--output", path, "--workers", "1", "--overwrite"]
+    command += ["--output", path, "--workers", "2", "--overwrite"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     with h5py.File(path) as file:
         assert file.attrs["made_by"].decode() == made_by
         assert json.loads(file.attrs["parameters"].decode())["hold_steps"] == 24
-    assert list(tmp_path.iterdir()) == [path]
+    assert path.read_bytes() == made.read_bytes() and list(tmp_path.iterdir()) == [path]
 
 
-def test_goals_are_in_the_goal_region_inside_a_shelf(tmp_path, monkeypatch):
-    monkeypatch.setattr(make_queries.workers, "run", in_this_process)
+def test_goals_are_in_the_goal_region_inside_a_shelf(tmp_path):
     path, region = tmp_path / "in_the_shelf.h5", (0.4, 0.65, -0.4, 0.4, 0.24, 0.46)
     make_queries.make_queries(path, "three_shelves", 0, 6, 2, progress=False, goal_region=region)
     splits = validate(path, "three_shelves", simulate=True)
@@ -319,8 +306,7 @@ def test_goals_are_in_the_goal_region_inside_a_shelf(tmp_path, monkeypatch):
         assert "--goal-region 0.4 0.65 -0.4 0.4 0.24 0.46" in file.attrs["made_by"].decode()
 
 
-def test_queries_inside_the_limits_of_the_datasheet_are_a_share_of_all(tmp_path, monkeypatch):
-    monkeypatch.setattr(make_queries.workers, "run", in_this_process)
+def test_queries_inside_the_limits_of_the_datasheet_are_a_share_of_all(tmp_path):
     path = tmp_path / "queries.h5"
     rejected = make_queries.make_queries(
         path, "no_obstacles", 0, 12, 2, progress=False, limits="datasheet"

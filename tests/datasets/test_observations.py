@@ -9,11 +9,7 @@ from roboarm_nmp.datasets.observations import Observations
 from roboarm_nmp.datasets.shards import shard_path
 from roboarm_nmp.envs.perception.sensors import (
     Camera,
-    PointCloud,
     SensorWorld,
-    cardinal,
-    sensors_from_json,
-    sensors_to_json,
 )
 from roboarm_nmp.scene_embedding_train import collect
 from roboarm_nmp.utils import workers
@@ -28,17 +24,10 @@ def shards(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
-def in_this_process(make_worker, arguments, jobs, *_, **__):
-    """As `workers.run`."""
-    yield from map(make_worker(*arguments), jobs)
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workers, "run", in_this_process)
-        collect.collect(args(folder), progress=False)
+    collect.collect(args(folder), progress=False)
     return folder
 
 
@@ -68,11 +57,6 @@ def test_stored_observations_are_those_of_the_sensors(whole):
     env.close()
 
 
-def test_sensors_are_stored_exactly():
-    sensors = {**cardinal(size=(64, 48), outputs=("depth",)), "cloud": PointCloud((1, 2, 3))}
-    assert sensors_from_json(sensors_to_json(sensors)) == sensors
-
-
 def test_files_do_not_depend_on_workers_or_on_earlier_shards(whole, tmp_path, monkeypatch):
     made = []
     run = workers.run
@@ -84,11 +68,9 @@ def test_files_do_not_depend_on_workers_or_on_earlier_shards(whole, tmp_path, mo
     for number in (0, 1):
         path = shard_path(tmp_path, number)
         path.write_bytes(shard_path(whole, number).read_bytes())
-    with monkeypatch.context() as patch:
-        patch.setattr(workers, "run", in_this_process)
-        collect.collect(args(tmp_path, num=3), progress=False)  # both exist, the last is longer
-        shard_path(tmp_path, 1).unlink()
-        collect.collect(args(tmp_path, num=3), progress=False)  # now it is shorter
+    collect.collect(args(tmp_path, num=3), progress=False)  # both exist, the last is longer
+    shard_path(tmp_path, 1).unlink()
+    collect.collect(args(tmp_path, num=3), progress=False)  # now it is shorter
     monkeypatch.setattr(workers, "run", record)
     collect.collect(args(tmp_path, workers=2), progress=False)
     assert made == [(1, 2, 4), (2, 4, 5)] and shards(tmp_path) == shards(whole)

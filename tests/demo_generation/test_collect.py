@@ -20,6 +20,7 @@ import numpy as np
 import psutil
 import pytest
 from paths import ROOT
+from trainers import roboarm
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.demonstrations import load_demos, write_demos
@@ -41,15 +42,13 @@ def options(**changes):
     return collect.options_of(collect.Args(TASK)) | changes
 
 
-def command(output, *flags, num=NUM, task=TASK):
-    arguments = ["--task", task, "--num", num, "--workers", 1, "--output", output, *flags]
-    return [sys.executable, "-m", "roboarm_nmp.demo_generation.collect", *map(str, arguments)]
+def words(output, *flags, num=NUM):
+    """Of a command."""
+    return ["collect", "--task", TASK, "--num", num, "--workers", 1, "--output", output, *flags]
 
 
-def run(output, *flags, **kwargs):
-    return subprocess.run(
-        command(output, *flags, **kwargs), cwd=ROOT, capture_output=True, text=True, timeout=100
-    )
+def command(output, *flags, **more):
+    return [sys.executable, "-m", "roboarm_nmp", *map(str, words(output, *flags, **more))]
 
 
 def journal_lines(output):
@@ -106,7 +105,7 @@ def has_ended(process):
 def whole(tmp_path_factory):
     """A file collected by one worker without interruption."""
     path = tmp_path_factory.mktemp("whole") / "demos.h5"
-    result = run(path)
+    result = roboarm(*words(path))
     assert result.returncode == 0, result.stderr
     assert f"{NUM} demonstrations from " in result.stdout and "solved" in result.stdout
     assert list(path.parent.iterdir()) == [path]
@@ -120,7 +119,7 @@ def output(tmp_path):
 
 def finish(output, whole, *flags):
     """Run the command on `output` to its end; the number of demonstrations it continues from."""
-    result = run(output, *flags)
+    result = roboarm(*words(output, *flags))
     assert result.returncode == 0, result.stderr
     assert output.read_bytes() == whole.read_bytes()
     assert list(output.parent.iterdir()) == [output]
@@ -221,7 +220,7 @@ def test_flipped_bit_drops_its_entry_and_is_reported(whole, journal, output):
     rng, flipped = np.random.default_rng(0), bytearray(journal)
     flipped[rng.integers(journal.index(b"\n") + 1, len(journal) - 1)] ^= 1 << rng.integers(8)
     collect.journal_of(output).write_bytes(flipped)
-    result = run(output)
+    result = roboarm(*words(output))
     assert result.returncode == 0 and output.read_bytes() == whole.read_bytes()
     assert f"{collect.journal_of(output)}: damaged, " in result.stderr
     begun = int(re.search(rf"(\d+)/{NUM}, ", result.stderr).group(1))
@@ -297,7 +296,7 @@ def test_file_that_is_no_journal_is_left_unchanged(output):
 def test_workers_that_always_die_are_an_error():
     warnings = []
     with pytest.raises(RuntimeError, match="workers died 5 times without a result"):
-        list(workers.run(os._exit, (1,), range(3), 1, warn=warnings.append))
+        list(workers.run(os._exit, (1,), range(3), 2, warn=warnings.append))
     assert len(warnings) == 4 and all("a worker died" in text for text in warnings)
 
 
@@ -383,16 +382,6 @@ def damaged(output, exact, straight, colliding):
     return write(output, demos), bad
 
 
-def verify_command(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "roboarm_nmp.demo_generation.verify", *map(str, arguments)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=100,
-    )
-
-
 def verdicts(path):
     verifier = Verifier(path, repair=False)
     return [verifier(index)[1] for index in range(len(verifier.demos))]
@@ -405,7 +394,7 @@ def test_verify_finds_bad_demonstrations(damaged):
     for verdict, index in bad.items():
         expected[index] = verdict
     assert verdicts(path) == expected
-    result = verify_command(path)
+    result = roboarm("verify", path, "--workers", 1)
     assert result.returncode == 1
     lines = result.stdout.splitlines()
     one_each = "1 changed, 1 missed, 1 collided, 1 refused"
@@ -416,7 +405,7 @@ def test_verify_finds_bad_demonstrations(damaged):
 def test_repair_replaces_or_removes_bad_demonstrations(damaged):
     path, bad = damaged
     old = load_demos(path)
-    result = verify_command(path, "--repair")
+    result = roboarm("verify", path, "--repair", "--workers", 1)
     assert result.returncode == 0, result.stderr
     assert "; 3 repaired, 1 removed" in result.stdout
     demos = load_demos(path)
@@ -475,7 +464,7 @@ def test_file_without_options_or_without_a_repairable_demonstration_is_an_error(
 
 def test_verify_continues_after_a_bad_file(whole, tmp_path):
     (tmp_path / "bad.h5").write_bytes(whole.read_bytes()[:3000])
-    result = verify_command(tmp_path / "bad.h5", tmp_path / "none.h5", whole)
+    result = roboarm("verify", tmp_path / "bad.h5", tmp_path / "none.h5", whole, "--workers", 1)
     assert result.returncode == 1 and "Traceback" not in result.stderr
     assert "bad.h5: " in result.stderr and "none.h5: no such file" in result.stderr
     assert f"{whole}: {NUM} good" in result.stdout
@@ -488,7 +477,7 @@ def test_verify_continues_after_a_bad_file(whole, tmp_path):
 def test_cluster_that_loses_a_node_collects_the_same_bytes(output, tmp_path, cluster):
     num = 150
     local = tmp_path / "local.h5"
-    assert run(local, "--workers", "2", num=num).returncode == 0
+    assert roboarm(*words(local, num=num)).returncode == 0
     with running(output, "--ray-address", cluster.address, demos=40, num=num) as process:
         cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
         assert journal_lines(output) < num - 40

@@ -1,12 +1,11 @@
 """Queries, demonstrations and roadmaps of another arm than the Panda, from the command line."""
 
 import shutil
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 from paths import ROOT
+from trainers import roboarm
 
 from roboarm_nmp.datasets.demonstrations import demo_path, load_demos
 from roboarm_nmp.datasets.queries import query_path, validate
@@ -23,16 +22,6 @@ ROBOTS = ROOT / "examples" / "robots"
 def file(tmp_path):
     """The file of an arm in a folder of its own."""
     return shutil.copy(ROBOTS / "xarm6.yaml", tmp_path / "xarm6.yaml")
-
-
-def roboarm(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "roboarm_nmp", *map(str, arguments)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=200,
-    )
 
 
 def test_queries_and_demonstrations_of_another_arm_are_made_and_verified(file):

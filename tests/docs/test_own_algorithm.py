@@ -18,7 +18,7 @@ def test_excerpts_of_the_walk_stand_in_the_trainer():
         assert excerpt in SAC
 
 
-def test_redq_diff_applies_and_trains_resumes_and_is_evaluated(tmp_path):
+def test_redq_diff_applies_and_trains_resumes_and_is_evaluated(tmp_path, short_episodes):
     (diff,) = re.findall(r"```diff\n(.*?)```", PAGE, re.DOTALL)
     assert len(re.findall(r"^\+(?!\+\+)", diff, re.MULTILINE)) <= 20
     run_here(ROOT / "examples" / "07_own_algorithm.py", "--folder", tmp_path, *TINIER.split())

@@ -1,32 +1,24 @@
 """docs/customise/scene.md from top to bottom with tiny numbers, and what it says of errors."""
 
-import contextlib
-import importlib
-import io
 import json
 import math
 import re
 import shlex
-import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-import tyro
 from paths import ROOT
 from PIL import Image
-from trainers import run_here
+from trainers import outcome_of, roboarm, run_here
 
-from roboarm_nmp import __main__
 from roboarm_nmp.datasets.demonstrations import load_demos
 from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.scenes.files import load_scene
 from roboarm_nmp.envs.scenes.primitives import FLOOR, TABLE
 
-SCRIPTS = ROOT / "clean_rl_scripts"
-sys.path.append(str(SCRIPTS))
 PAGE = (ROOT / "docs/customise/scene.md").read_text()
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", PAGE, re.S | re.M)
 COMMANDS = [
@@ -40,66 +32,38 @@ YAML = next(text for kind, text in BLOCKS if kind == "yaml")
 POSTS = [text for kind, text in BLOCKS if kind == "python"][-1]
 
 # Numbers of the page -> of this test, and flags that the page leaves at their defaults.
-FEWER = {"1000": "6"}
+FEWER = {"1000": "3"}
 ONE_WORKER = ["--workers", "1"]
 TINY = {
-    "queries": ["--num-validation", "4", *ONE_WORKER],
+    "queries": ["--num-validation", "2", *ONE_WORKER],
     "collect": ONE_WORKER,
     "verify": ONE_WORKER,
     "show": ["--size", "80", "60"],
     "sac_her_mp.py": shlex.split(
         "--hidden-size 16 --batch-size 16 --updates-per-step 0.1 --learning-starts 200 "
-        "--num-envs 2 --horizon 50 --eval-every 400 --eval-queries 2 --test-queries 3 "
+        "--num-envs 2 --horizon 50 --eval-every 400 --eval-queries 1 --test-queries 2 "
         "--total-timesteps 400"
     ),
 }
-
-
-@dataclass
-class Result:
-    code: int
-    out: str
-    error: str
 
 
 def run(command):
     """A command as one would type it in the repository's folder, but in the current one."""
     if "runs/RUN" in command and Path("runs").exists():
         command = command.replace("runs/RUN", str(next(Path("runs").iterdir())))
-    words = [FEWER.get(word, word) for word in shlex.split(command)][1:]
-    name = Path(words[0]).name
-    arguments = words[1:] + TINY.get(name, [])
-    out, error = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):
-        try:
-            code = main_of(name)(arguments)
-        except SystemExit as end:
-            code = end.code
-    if isinstance(code, str):  # as the interpreter does
-        error.write(code + "\n")
-        code = 1
-    return Result(code or 0, out.getvalue(), error.getvalue())
-
-
-def main_of(name):
-    """The function of a script or of a subcommand of `roboarm`, which takes its arguments."""
-    if name == "sac_her_mp.py":  # all that it does is in its `if __name__ == "__main__"`
-        return lambda arguments: run_here(SCRIPTS / name, *arguments)
-    path = __main__.COMMANDS[name][0]
-    module = importlib.import_module(f"roboarm_nmp.{path}")
-    if hasattr(module, "__path__"):
-        module = importlib.import_module(f"roboarm_nmp.{path}.__main__")
-    if name in ("data", "show", "evaluate"):
-        return module.main
-    return lambda arguments: module.main(tyro.cli(module.Args, args=arguments))
+    program, name, *arguments = [FEWER.get(word, word) for word in shlex.split(command)]
+    arguments += TINY.get(Path(name).name, [])
+    if program == "roboarm":
+        return roboarm(name, *arguments)
+    return outcome_of(run_here, ROOT / name, *arguments)
 
 
 def error_of(command):
     """The one line of a command that must fail."""
     result = run(command)
-    lines = [line for line in result.error.splitlines() if line and "0%, " not in line]  # its bar
+    lines = [line for line in result.stderr.splitlines() if line and "0%, " not in line]  # its bar
     lines = [line for line in lines if not line.startswith("pybullet build time")]
-    assert result.code in (1, 2) and len(lines) == 1, result.error
+    assert result.returncode in (1, 2) and len(lines) == 1, result.stderr
     return lines[0]
 
 
@@ -136,8 +100,8 @@ def result_of(page, part):
 def test_commands_of_the_page_work(page):
     assert len(page[1]) == len(COMMANDS) == 14
     for command, result in page[1].items():
-        assert result.code == 0, (command, result.error)
-        assert "Traceback" not in result.error
+        assert result.returncode == 0, (command, result.stderr)
+        assert "Traceback" not in result.stderr
     assert sorted(path.name for path in page[0].iterdir()) == [
         "episode.gif",
         "from_python.yaml",
@@ -168,13 +132,13 @@ def test_queries_and_demonstrations_are_beside_the_scene(page):
     scene = load_scene(task)
     test, validation = load_queries(task, "test"), load_queries(task, "validation")
     demos = load_demos(task)
-    assert (len(test), len(validation), len(demos)) == (6, 4, 6)
+    assert (len(test), len(validation), len(demos)) == (3, 2, 3)
     assert test.task == demos.task == "my_scene"
-    assert test[5].scene == demos[5].scene == scene
-    assert "6 test and 4 validation queries for my_scene" in result_of(page, "validate").out
-    assert "(0.000)" in result_of(page, "roboarm queries").out  # not solved
-    assert "6 good, 0 changed" in result_of(page, "verify").out
-    assert "demonstrations | 6\n" in result_of(page, "describe").out
+    assert test[2].scene == demos[2].scene == scene
+    assert "3 test and 2 validation queries for my_scene" in result_of(page, "validate").stdout
+    assert "(0.000)" in result_of(page, "roboarm queries").stdout  # not solved
+    assert "3 good, 0 changed" in result_of(page, "verify").stdout
+    assert "demonstrations | 3\n" in result_of(page, "describe").stdout
     images = [np.asarray(Image.open(page[0] / f"{name}.png")) for name in ("scene", "scenes")]
     assert [image.shape for image in images] == [(60, 80, 3), (120, 160, 3)]
 
@@ -183,15 +147,15 @@ def test_run_of_the_page_is_trained_and_evaluated(page):
     [run_folder] = (page[0] / "runs").iterdir()
     assert run_folder.name.startswith("my_scene__sac_her_mp__1__")
     result = json.loads((run_folder / "result.json").read_text())
-    assert (result["task"], result["num_queries"], result["steps"]) == ("my_scene.yaml", 3, 400)
+    assert (result["task"], result["num_queries"], result["steps"]) == ("my_scene.yaml", 2, 400)
     checkpoint = torch.load(run_folder / "checkpoint.pt", weights_only=True)
     assert checkpoint["progress"]["demos_injected"] > 0
     for policy in ("runs/RUN", "go-to-goal", "via-points", "planner"):
-        text = result_of(page, f"roboarm evaluate --task my_scene.yaml --policy {policy}").out
-        assert "on my_scene.yaml: 6 test queries" in text
+        text = result_of(page, f"roboarm evaluate --task my_scene.yaml --policy {policy}").stdout
+        assert "on my_scene.yaml: 3 test queries" in text
         if policy == "planner":  # the queries are solvable
             assert re.search(r"success +1\.0000", text)
-    assert f"runs/{run_folder.name}: " in result_of(page, "--policy runs/RUN --output").out
+    assert f"runs/{run_folder.name}: " in result_of(page, "--policy runs/RUN --output").stdout
 
 
 # --- What is refused

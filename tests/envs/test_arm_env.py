@@ -9,7 +9,6 @@ import gymnasium as gym
 import numpy as np
 import psutil
 import pytest
-import stable_baselines3
 import torch
 from gymnasium.utils.env_checker import check_env
 from paths import ROOT
@@ -348,22 +347,6 @@ def test_vector_envs(vector_env):
         assert truncated.all() == (step == 4)
     assert infos["final_obs"][1]["desired_goal"].shape == (3,)
     vector.close()
-
-
-def test_stable_baselines3_sac_with_her_trains():
-    env = gym.make("RoboArmNMP/NoObstacles-v0", horizon=20)
-    model = stable_baselines3.SAC(
-        "MultiInputPolicy",
-        env,
-        replay_buffer_class=stable_baselines3.HerReplayBuffer,
-        replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
-        learning_starts=60,
-        seed=0,
-    )
-    model.learn(120)
-    sample = model.replay_buffer.sample(500)
-    # Some goals are relabelled into reached ones.
-    assert 0 < (sample.rewards == 0).float().mean() < 1
 
 
 def test_episodes_leave_no_memory_behind(env):

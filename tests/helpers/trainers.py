@@ -1,19 +1,23 @@
-"""Trainers as modules and as commands, for the tests."""
+"""Trainers as modules and as commands, and `roboarm` in this process, for the tests."""
 
+import contextlib
 import functools
 import importlib.util
+import io
 import runpy
 import signal
 import subprocess
 import sys
-import time
+import warnings
 from unittest.mock import patch
 
 import pytest
 import torch
 from paths import ROOT
 
-from roboarm_nmp import envs
+from roboarm_nmp import __main__, envs
+from roboarm_nmp.evaluation import evaluate
+from roboarm_nmp.training import runs
 
 PATHS = {
     "sac_her_mp": ROOT / "clean_rl_scripts" / "sac_her_mp.py",
@@ -89,37 +93,85 @@ def run_script(trainer, folder, *flags):
     return next(folder.iterdir())
 
 
-def killed_run(trainer, folder, *flags):
-    """The folder of such a run in another process, which is killed after its first checkpoint."""
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    process = subprocess.Popen(command(trainer, folder, *flags), **quiet)
-    deadline = time.time() + 300
-    while not list(folder.glob("*/checkpoint.pt")) and time.time() < deadline:
-        time.sleep(0.02)
-    process.kill()
-    process.wait()
+class Stopped(BaseException):
+    """The end of a run right after its first checkpoint."""
+
+
+def stopped_run(folder, *words):
+    """The folder of a run in which nothing is executed after its first checkpoint.
+
+    (Processes are killed at random moments in tests/robustness/attacks/kills.py.)
+    """
+
+    def save_and_stop(run, save=runs.Run.save):
+        save(run)
+        raise Stopped
+
+    with patch.object(runs.Run, "save", save_and_stop), pytest.raises(Stopped):
+        run_here(*words)
     (run,) = folder.iterdir()
     assert not (run / "result.json").exists()
     return run
 
 
-def run_here(script, *arguments):
-    """Run a script in this process, so that a test can patch its imports.
+@contextlib.contextmanager
+def short_evaluations(steps=30):
+    """A context in which episodes of evaluations are over after so many steps."""
 
-    Settings of torch and signal handlers are restored.
-    """
+    def make_short(job, make=evaluate._Job.make, **options):
+        env, begin = make(job, **options)
+        env.unwrapped.horizon = steps
+        return env, begin
+
+    with patch.object(evaluate._Job, "make", make_short):
+        yield
+
+
+@contextlib.contextmanager
+def as_command(*argv):
+    """A context for a command in this process: settings of torch and of signals are restored."""
     state, threads = torch.get_rng_state(), torch.get_num_threads()
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    argv = patch.object(sys, "argv", [str(script), *map(str, arguments)])
-    with argv, patch.object(sys, "excepthook", sys.excepthook):
+    with (
+        patch.object(sys, "argv", [str(word) for word in argv]),
+        patch.object(sys, "excepthook", sys.excepthook),
+        warnings.catch_warnings(),
+    ):
+        warnings.filterwarnings("ignore", ".*found in sys.modules")
         try:
-            runpy.run_path(str(script), run_name="__main__")
+            yield
         finally:
             for number, handler in handlers.items():
                 signal.signal(number, handler)
             torch.use_deterministic_algorithms(False)
             torch.set_num_threads(threads)
             torch.set_rng_state(state)
+
+
+def run_here(script, *arguments):
+    """Run a script in this process, so that a test can patch its imports."""
+    with as_command(script, *arguments):
+        runpy.run_path(str(script), run_name="__main__")
+
+
+def outcome_of(function, *arguments):
+    """The result of a command's function as `subprocess.run` has it."""
+    out, errors, code = io.StringIO(), io.StringIO(), 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
+        try:
+            code = function(*arguments)
+        except SystemExit as end:
+            code = end.code
+    if isinstance(code, str):  # as the interpreter does
+        errors.write(f"{code}\n")
+        code = 1
+    return subprocess.CompletedProcess(arguments, code or 0, out.getvalue(), errors.getvalue())
+
+
+def roboarm(*arguments):
+    """The result of `roboarm ARGUMENTS` in this process, which saves seconds of imports."""
+    with as_command("roboarm"):
+        return outcome_of(__main__.main, [str(argument) for argument in arguments])
 
 
 def succeeds_here(script, *arguments):

@@ -356,10 +356,9 @@ def _nested():
     return graph
 
 
-# Millions of empty operators, of attributes of one operator, and of numbers in one tensor.
+# Millions of empty operators, and of numbers in one tensor.
 BOMBS = {
     "operators": lambda: _field(1, b"") * 40_000_000,
-    "attributes": lambda: _field(1, _field(5, b"") * 40_000_000),
     "nested": _nested,
     "numbers": lambda: _field(5, _field(7, bytes(80_000_000))),
 }

@@ -117,6 +117,7 @@ def test_policy_with_an_encoder_is_trained_and_evaluated(
     flags += ["--goal-type", "combined", "--demos", few_demos, "--eval-queries", "1"]
     if trainer == "sac_her_mp":
         flags += ["--demo-prob", "1", "--geometry-source", "ground_truth", "--link-distances"]
+        flags += ["--learning-starts", "60", "--eval-every", "150", "--total-timesteps", "150"]
     run = run_script(trainer, tmp_path, *flags)
     trained = load_network(run / "policy.onnx").metadata["env"]
     assert trained["encoder"] == "oracle"

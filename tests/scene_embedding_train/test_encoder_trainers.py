@@ -1,17 +1,13 @@
 """Runs of the encoders' trainers on a few scenes: files, resume, devices, errors."""
 
 import json
-import os
-import signal
-import subprocess
-import time
 
 import numpy as np
 import pytest
 import torch
 from encoder_trainers import FOLDER, OF_CLOUDS, SCRIPTS, command
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from trainers import GPU, error_here, run_here, shared_blocks
+from trainers import GPU, error_here, run_here, shared_blocks, stopped_run
 
 from roboarm_nmp.datasets.observations import Observations
 from roboarm_nmp.envs.perception.encoders import make_encoder
@@ -84,7 +80,7 @@ def test_saved_encoder_runs_without_its_script(run, observations):
 
 
 @pytest.mark.parametrize("device", ["cpu", GPU])
-def test_killed_and_resumed_is_bit_identical_to_uninterrupted(
+def test_stopped_and_resumed_is_bit_identical_to_uninterrupted(
     run, observations, tmp_path, device, capsys
 ):
     name, finished = run
@@ -94,20 +90,8 @@ def test_killed_and_resumed_is_bit_identical_to_uninterrupted(
         whole = tmp_path / "whole"
         run_here(*command(name, observations, whole, "--device", device)[1:])
         (finished,) = whole.iterdir()
-    killed = tmp_path / "killed"
-    process = subprocess.Popen(
-        command(name, observations, killed, "--device", device),
-        start_new_session=True,
-        stderr=subprocess.DEVNULL,
-    )
-    until = time.time() + 300
-    while not list(killed.glob("*/checkpoint.pt")):
-        assert time.time() < until
-        time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-    folder = next(killed.iterdir())
-    assert not (folder / "result.json").exists()
+    parts = tmp_path / "parts"
+    folder = stopped_run(parts, *command(name, observations, parts, "--device", device)[1:])
     run_here(FOLDER / f"{name}.py", "--resume", folder)
     one, other = (
         torch.load(path / "checkpoint.pt", weights_only=True)["model"]

@@ -1,7 +1,5 @@
 """training/arguments.py and runs.py: flags, checkpoints, logs, signals."""
 
-import contextlib
-import io
 import json
 import re
 import signal
@@ -329,17 +327,6 @@ def test_damaged_checkpoint_is_rejected_by_name(parse, tmp_path):
     (run / "checkpoint.pt").write_bytes(content[: len(content) // 2])
     with pytest.raises(SystemExit, match="checkpoint.pt is damaged"):
         runs.Run(args, "wall", parts())
-    saved = torch.load(io.BytesIO(content), weights_only=True)
-    rng, unnoticed = np.random.default_rng(0), 0
-    for _ in range(20):
-        flipped = bytearray(content)
-        flipped[rng.integers(len(content))] ^= 1 << rng.integers(8)
-        (run / "checkpoint.pt").write_bytes(flipped)
-        with contextlib.suppress(SystemExit):
-            runs.Run(args, "wall", parts())
-            unnoticed += 1  # nothing but padding or a date was hit:
-            assert str(torch.load(run / "checkpoint.pt", weights_only=True)) == str(saved)
-    assert unnoticed < 10
 
 
 def test_events_of_repeated_steps_are_hidden(parse, tmp_path):

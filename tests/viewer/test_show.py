@@ -1,6 +1,5 @@
 """`roboarm show`: images and animations, the policy in them, and errors."""
 
-import math
 import os
 import re
 
@@ -14,12 +13,9 @@ from torch import nn
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.demonstrations import load_demos
 from roboarm_nmp.datasets.queries import Query, load_queries, write_queries
-from roboarm_nmp.envs.point_images import OBSERVED_COLOUR, point_image
 from roboarm_nmp.envs.robots.panda import PANDA
-from roboarm_nmp.envs.scenes.primitives import ObservedScene
 from roboarm_nmp.motions.trajectories import load_joint_path, save_joint_path
 from roboarm_nmp.networks.export import save_network
-from roboarm_nmp.utils.bullet import pybullet as p
 from roboarm_nmp.viewer import images, show
 
 SMALL = (96, 72)
@@ -65,48 +61,19 @@ def test_images_of_several_queries_form_a_grid(tmp_path, capsys):
     assert (tiles[3] == 255).all()
 
 
-def share(pixels, colour):
-    """The share of pixels whose hue is about that of a colour."""
-    direction = np.array(colour) / np.linalg.norm(colour)
-    bright = np.linalg.norm(pixels.astype(float), axis=-1)
-    return ((pixels @ direction > 0.97 * bright) & (bright > 60)).mean()
-
-
-def test_cloud_is_seen_with_what_was_left_out_and_the_swept_motion(tmp_path, capsys):
+def test_what_was_left_out_of_a_cloud_is_counted(tmp_path, capsys):
     rng = np.random.default_rng(0)
     wall = rng.uniform((0.55, -0.4, 0.02), (0.56, 0.4, 0.6), (3000, 3))
     far = rng.uniform((0.5, -0.9, 2.0), (0.9, 0.9, 2.02), (500, 3))
     np.save(tmp_path / "cloud.npy", np.concatenate([wall, far]).astype(np.float32))
     save_joint_path(tmp_path / "a.csv", np.linspace(BENT, AT_THE_SIDE, 30), np.arange(30) / 30)
-    cloud = ["--cloud", tmp_path / "cloud.npy", "--output", tmp_path / "a.png"]
-    cloud += ["--size", 240, 180]
+    cloud = ["--cloud", tmp_path / "cloud.npy", "--output", tmp_path / "a.png", *SIZE]
     assert run(*cloud, "--trajectory", tmp_path / "a.csv") == 0
     assert "500 outside the workspace" in capsys.readouterr().out
-    pixels = pixels_of(tmp_path / "a.png")
-    assert share(pixels, OBSERVED_COLOUR) > 0.03 and share(pixels, images.TRACE_COLOUR) > 0.0001
-    # A query among the points has no path; in an environment, the points are seen as well.
-    assert run(*cloud) == 0
-    pixels = pixels_of(tmp_path / "a.png")
-    assert share(pixels, OBSERVED_COLOUR) > 0.03 and share(pixels, images.TRACE_COLOUR) == 0
-    with envs.make(ObservedScene(points=wall), render_mode="rgb_array") as env:
-        env.reset(seed=0)
-        assert share(env.render(), OBSERVED_COLOUR) > 0.03
+    assert pixels_of(tmp_path / "a.png").std() > 10
     assert run("wall", *cloud) == 2 and "wall has obstacles" in capsys.readouterr().err
     assert run("wall", "--units", "mm", "--output", "a.png") == 2
     assert "--units goes with --cloud" in capsys.readouterr().err
-
-
-def test_points_hide_what_is_behind_them_and_are_hidden():
-    view = p.computeViewMatrix((0, 0, 0), (1, 0, 0), (0, 0, 1))
-    projection = p.computeProjectionMatrixFOV(60, 1.0, 0.1, 10.0)
-    clouds = [([(2.0, 0, 0)], 0.2, (255, 0, 0)), ([(3.0, 0, 0), (-1.0, 0, 0)], 1.0, (0, 255, 0))]
-    drawn = point_image(clouds, view, projection, (61, 61))
-    assert drawn.colour[30, 30].argmax() == 0 and drawn.colour[30, 22].argmax() == 1
-    red = drawn.colour[..., 0] > 100
-    assert abs(red.sum() - math.pi * (0.2 / 2 * 30.5 / math.tan(math.pi / 6)) ** 2) < 8
-    nearer = np.full((61, 61), 0.9)
-    colour, _ = drawn.over(np.zeros((61, 61, 3), np.uint8), nearer)
-    assert not colour.any() and np.isinf(drawn.depth[0, 0]) and 0.9 < drawn.depth[30, 30] < 1
 
 
 # --- Animations

@@ -6,11 +6,9 @@ from paths import ROOT
 
 from roboarm_nmp.envs.robots.body import Body  # noqa: E402
 from roboarm_nmp.envs.robots.files import load_robot
-from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.robots.urdf import robot_from_urdf
-from roboarm_nmp.envs.robots.variants import with_attached
 from roboarm_nmp.envs.scenes.files import load_scene
-from roboarm_nmp.envs.scenes.primitives import Attached, Box, Sphere, convex_hull
+from roboarm_nmp.envs.scenes.primitives import Sphere
 from roboarm_nmp.utils.bullet import pybullet as p
 from roboarm_nmp.viewer.episodes import task_episodes
 from roboarm_nmp.viewer.simulation import PolicyArm, Simulation
@@ -151,16 +149,3 @@ def test_saving_a_scene_never_replaces_a_file(tmp_path):
     assert names == ["mine_2.yaml", "mine_3.yaml"] and first.read_bytes() == before
     assert load_scene(tmp_path / "mine_2.yaml") == shown.query.scene
     shown.close()
-
-
-def test_attached_objects_are_drawn_where_their_links_are():
-    hull = convex_hull(np.random.default_rng(0).uniform(-0.05, 0.05, (12, 3)), (0, 0, 0.1))
-    shapes = (Sphere((0, 0, 0.1), 0.05), Box((0, 0, 0.15), (0.05, 0.1, 0.2)), hull)
-    robot = with_attached(PANDA, [Attached(shape, "panda_hand") for shape in shapes])
-    links = [link.index for link in robot.links[-3:]]
-    hand = {joint.link: joint.parent for joint in arm_joints(robot)}
-    assert {hand[link] for link in links} == {8}
-    drawn = link_meshes(robot, 1e-4)
-    extents = [np.ptp(drawn[link][0][1], axis=0) for link in links]
-    np.testing.assert_allclose(extents[1], (0.05, 0.1, 0.2), atol=1e-3)
-    np.testing.assert_allclose(extents[2], np.ptp(hull.vertices, axis=0), atol=1e-3)

@@ -12,7 +12,6 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.distance import cdist
 
 from roboarm_nmp import envs
-from roboarm_nmp.datasets.queries import load_queries
 from roboarm_nmp.envs.collision import checker as collision
 from roboarm_nmp.envs.collision.checker import (
     ARM,
@@ -150,17 +149,6 @@ def test_random_scenes_agree_with_pybullet(tmp_path, name):
     world.close()
 
 
-def test_starts_and_goals_of_queries_are_free():
-    for task in envs.TASKS:
-        queries = load_queries(task, "validation")
-        for i in (0, 20):
-            if not queries[i].scene.is_static:  # tests/envs/scenes/test_moving_boxes.py
-                continue
-            checker = CollisionChecker(queries[i].scene)
-            ends = np.clip(PANDA.normalise([queries[i].start, queries[i].goal]), -1, 1)
-            assert checker.is_free(ends).all(), (task, i)
-
-
 def test_distances_agree_with_pybullet(env):
     """Each link's distance from obstacles of all kinds, apart and overlapping, by Bullet's GJK."""
     rng, further = np.random.default_rng(7), []
@@ -232,20 +220,6 @@ def test_depth_is_the_way_to_the_nearest_face(hulls, kind):
         np.testing.assert_allclose(normal, axes[ways.argmin()], atol=1e-3)
 
 
-def test_nearest_or_deepest_of_several_obstacles_counts():
-    rng = np.random.default_rng(5)
-    scene = Scene(tuple(o for _ in range(5) for o in random_scene(rng).obstacles), None, None)
-    states = rng.uniform(-1, 1, (1000, 7))
-    together = CollisionChecker(scene).signed_distances(states, self_collisions=False)
-    alone = []
-    for obstacle in scene.obstacles:
-        checker = CollisionChecker(replace(scene, obstacles=(obstacle,)))
-        alone.append(checker.signed_distances(states, self_collisions=False).distance)
-    alone = np.stack(alone)
-    assert ((alone < -0.02).sum(0) > 1).sum() > 100  # in two of them at once
-    np.testing.assert_allclose(together.distance, alone.min(0), atol=1e-6)
-
-
 def test_coinciding_centres_have_a_depth(hulls):
     """GJK has no initial direction there."""
     for link in range(len(LINKS)):
@@ -253,25 +227,6 @@ def test_coinciding_centres_have_a_depth(hulls):
         scene = Scene((Sphere(tuple(centre), 0.001),), table=None, floor=None)
         near = CollisionChecker(scene).signed_distances(STATE, self_collisions=False)
         assert near.distance[link] < -0.005
-
-
-def test_distance_grows_along_the_normal():
-    """Moving the obstacle against the normal moves it away by as much."""
-    rng, step = np.random.default_rng(3), 1e-4
-    for obstacle in random_scene(rng).obstacles:
-        scene = Scene((obstacle,), table=None, floor=None)
-        state = rng.uniform(-1, 1, 7)
-        near = CollisionChecker(scene).signed_distances(state, self_collisions=False)
-        for link in (3, 7, 9):
-            moved = tuple(obstacle.position - step * near.normal[link])
-            scene = Scene((replace(obstacle, position=moved),), None, None)
-            there = CollisionChecker(scene).signed_distances(state, self_collisions=False)
-            assert there.distance[link] - near.distance[link] == pytest.approx(step, rel=0.02)
-            # The witness is on the link, at that distance from the obstacle.
-            if isinstance(obstacle, Sphere) and near.distance[link] > 0:
-                away = near.witness[link] - obstacle.position
-                expected = np.linalg.norm(away) - obstacle.radius - BULLET_MARGIN
-                assert near.distance[link] == pytest.approx(expected, abs=1e-6)
 
 
 def test_geometry_is_the_nearest_obstacle_table_floor_or_arm():

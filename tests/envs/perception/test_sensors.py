@@ -11,7 +11,6 @@ from paths import ROOT
 from roboarm_nmp import envs
 from roboarm_nmp.envs.perception.sensors import (
     CARDINAL,
-    NOTHING,
     OUTPUTS,
     Camera,
     PointCloud,
@@ -35,19 +34,6 @@ def world():
     world = SensorWorld()
     yield world
     world.close()
-
-
-def test_point_cloud_equals_a_camera_in_its_place(world):
-    world.show(envs.TASKS["boxes"].scene, HOME)
-    cloud = cardinal(PointCloud, num_samples=2500)["left"].observe(world)
-    image = cardinal(size=(50, 50), outputs=("depth", "segmentation"))["left"].observe(world)
-    visible = image["segmentation"] != NOTHING
-    hits = cloud["labels"] != NOTHING
-    np.testing.assert_array_equal(cloud["labels"][hits], image["segmentation"][visible])
-    ahead = np.array([0.0, -1.6, -0.4]) / math.hypot(1.6, 0.4)  # the viewing direction
-    depth = (cloud["points"][hits] - np.array([0.0, 1.6, 0.8])) @ ahead
-    np.testing.assert_allclose(depth, image["depth"][visible], atol=1e-5)
-    assert (image["depth"][~visible] == 5.0).all()
 
 
 def test_observations_depend_on_scene_and_arm_only(world):

@@ -7,6 +7,8 @@ import sys
 import pytest
 from paths import ROOT
 
+from roboarm_nmp.utils.files import cache_folder
+
 EPISODE = """
 import hashlib, locale, sys
 import numpy as np
@@ -39,6 +41,7 @@ def test_decimal_comma_changes_no_number(task, tmp_path):
     outputs = []
     for arguments in ([task, name], [task]):
         environment = {"LOCPATH": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path)}
+        environment["NUMBA_CACHE_DIR"] = str(cache_folder() / "numba")  # nothing is compiled again
         process = subprocess.run(
             [sys.executable, "-c", EPISODE, *arguments],
             capture_output=True,

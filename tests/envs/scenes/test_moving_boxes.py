@@ -101,13 +101,10 @@ def test_file_of_another_version_of_the_distribution_is_out_of_date(monkeypatch)
         load_queries("moving_boxes_hard")
 
 
-def test_query_file_repeats_the_tasks_own_for_any_number_of_workers(tmp_path):
-    task = "moving_boxes_easy"
-    for workers in (1, 2):
-        path = tmp_path / f"{workers}.h5"
-        make_queries(path, task, 0, 2, 1, num_workers=workers, progress=False)
-    assert (tmp_path / "1.h5").read_bytes() == (tmp_path / "2.h5").read_bytes()
-    queries = load_queries(tmp_path / "1.h5", task=task)
+def test_query_file_repeats_the_tasks_own(tmp_path):
+    task, path = "moving_boxes_easy", tmp_path / "1.h5"
+    make_queries(path, task, 0, 2, 1, num_workers=1, progress=False)
+    queries = load_queries(path, task=task)
     assert queries[1].scene == queries[:2][1].scene != queries[0].scene
     stored = load_queries(task)
     assert (queries.start[0] == stored.start[0]).all() and (queries.goal[0] == stored.goal[0]).all()
