@@ -37,12 +37,13 @@ if importlib.util.find_spec("ompl") is None:
     sys.meta_path.append(_SkipWithoutOmpl())
 
 
-# Files that take a minute and more. They begin first, so that no process is left alone with one.
+# Files that take long begin first, so that no process is left alone with one. The first compiles
+# the collision checks. The other process begins with files that need none of them.
 LONG = (
-    "test_browser",
-    *("test_trainers", "test_encoder_policies", "test_encoder_trainers", "test_devices"),
-    *("test_td3_her_mp", "test_roadmap_bc", "test_bc", "test_collect", "test_own_algorithm"),
-    *("test_evaluation", "test_paper_tables", "test_own_scene", "test_sac_her_mp", "test_learning"),
+    *("test_may_touch", "test_encoder_trainers", "test_collision", "test_learning", "test_bc"),
+    *("test_networks", "test_trainers", "test_roadmap_bc", "test_flow", "test_collect"),
+    *("test_evaluation", "test_trainers_of_robots", "test_sac_her_mp", "test_devices"),
+    *("test_encoder_policies", "test_own_scene", "test_datasets", "test_browser"),
 )
 
 

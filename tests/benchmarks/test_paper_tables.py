@@ -58,8 +58,3 @@ def test_run_is_kept_and_not_done_again(
     capfd.readouterr()
     paper_tables.run(cell, 5, 60, 2, tmp_path / "runs")
     assert capfd.readouterr().out == "bc-config-wall-s5: done before\n"
-    # More queries: no training, and none of its files are needed.
-    paper_tables.run(cell, 5, 60, 3, tmp_path / "not_there")
-    assert "--total-updates" not in capfd.readouterr().out
-    more = json.loads((tmp_path / "policies" / "bc-config-wall-s5.json").read_text())
-    assert more["num_queries"] == 3 and more["curve"] == kept["curve"]

@@ -309,10 +309,11 @@ def test_cloning_adds_demonstrated_transitions_to_every_batch(tmp_path, demo_fil
 def test_resumed_run_with_cloning_is_the_same(tmp_path, demo_file):
     # Two files, as one and in parts.
     flags = [*CLONING, "--demos", str(demo_file), str(demo_file)]
-    flags += ["--eval-queries", "1", "--test-queries", "0"]
+    flags += ["--eval-queries", "1", "--test-queries", "0", "--learning-starts", "100"]
+    flags += ["--eval-every", "150", "--total-timesteps", "300"]
     whole = run_script("td3_her_mp", tmp_path / "whole", *flags)
-    parts = run_script("td3_her_mp", tmp_path / "parts", *flags, "--total-timesteps", "300")
-    run_here(PATHS["td3_her_mp"], "--resume", parts, "--total-timesteps", "600")
+    parts = run_script("td3_her_mp", tmp_path / "parts", *flags, "--total-timesteps", "150")
+    run_here(PATHS["td3_her_mp"], "--resume", parts, "--total-timesteps", "300")
     one, other = (torch.load(run / "checkpoint.pt", weights_only=True) for run in (whole, parts))
     for name in ("actor", "actor_average", "critics"):
         for key, tensor in one[name].items():

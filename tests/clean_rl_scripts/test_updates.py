@@ -191,6 +191,15 @@ def test_update_of_td3(bc_weight, monkeypatch):
     assert_moved(old["actor_target"], new["actor_target"], new["actor"], 0.1)
 
 
+def test_exploration_noise_of_td3_has_the_given_size():
+    agent, data = make(td3, "TD3", exploration_noise=0.2), batch()
+    given = {"observation": data["observation"], "achieved_goal": None}
+    given["desired_goal"] = data["desired_goal"]
+    with torch.no_grad():
+        noise = agent.explore(given)["actions"] - agent.actor.eval()(**given)
+    assert 0.18 < noise.std() / 0.06 < 0.22 and noise.mean().abs() < 0.03 * 0.06
+
+
 def test_update_of_behavioural_cloning():
     torch.manual_seed(1)
     actor = bc.Actor(bc.Args(goal_type="ee", hidden_size=16, num_modes=1), panda_env())

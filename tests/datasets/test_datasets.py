@@ -5,7 +5,6 @@ import fcntl
 import json
 import subprocess
 import sys
-import textwrap
 
 import h5py
 import numpy as np
@@ -226,42 +225,6 @@ def test_simulation_finds_infeasible_queries(made, tmp_path):
     validate(path)
     with pytest.raises(DatasetError, match=r"infeasible.h5: validation/goal\[7\] is not feasible"):
         validate(path, simulate=True)
-
-
-# --- Killed writers
-
-
-KILLED_IN_THE_MIDDLE = """
-    import os, sys, time
-    import numpy as np
-    from roboarm_nmp.datasets.queries import write_queries
-
-    def wait(descriptor):
-        print("in the middle", flush=True)
-        time.sleep(60)
-
-    os.fsync = wait  # after the bytes, before they are on the disk under the file's name
-    queries = np.full((5, 7), -0.05, np.float32), np.full((5, 7), -0.06, np.float32)
-    splits = {"test": queries, "validation": queries[::-1]}
-    write_queries(sys.argv[1], "wall", 0, splits, "", {})
-"""
-
-
-def test_writer_killed_in_the_middle_leaves_the_old_file(path):
-    before = path.read_bytes()
-    process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(KILLED_IN_THE_MIDDLE), path],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout.readline() == "in the middle\n"
-    process.kill()
-    process.communicate()
-    assert path.read_bytes() == before
-    write(path)  # in spite of leftovers of the killed writer
-    assert path.read_bytes() == before
-    assert list(path.parent.iterdir()) == [path]
 
 
 # --- Commands

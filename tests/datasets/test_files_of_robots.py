@@ -7,7 +7,7 @@ import pytest
 from paths import ROOT
 
 from roboarm_nmp.datasets.__main__ import main
-from roboarm_nmp.datasets.demonstrations import demo_path, describe, load_demos, write_demos
+from roboarm_nmp.datasets.demonstrations import demo_path, load_demos, write_demos
 from roboarm_nmp.datasets.format import DatasetError
 from roboarm_nmp.datasets.queries import load_queries, query_path, write_queries
 from roboarm_nmp.envs.robots.files import load_robot
@@ -73,37 +73,6 @@ def test_robot_follows_a_task_and_not_a_folder(text, task, robot, name):
     assert split_robot(text) == (task, robot)
     assert task_name(text) == name
     assert is_task(text) and not is_task("wall@iiwa_queries.h5")
-
-
-def test_queries_of_six_joints_round_trip(file):
-    task = f"random_boxes_hard@{file}"
-    splits = write_some_queries(query_path(task), task)
-    robot = load_robot(file)
-    for split, (start, goal, scenes) in splits.items():
-        queries = load_queries(task, split)
-        np.testing.assert_array_equal(queries.start, start)
-        np.testing.assert_array_equal(queries.goal, goal)
-        np.testing.assert_allclose(
-            queries.goal_position, robot.forward_kinematics(goal), rtol=0, atol=1e-6
-        )
-        assert [query.scene for query in queries] == scenes
-        assert queries[0].scene.robot == robot and queries.task == "random_boxes_hard@xarm6"
-    by_path = load_queries(query_path(task), task=task)
-    np.testing.assert_array_equal(by_path.start, splits["test"][0])
-
-
-def test_demonstrations_of_six_joints_round_trip(file):
-    task = f"no_obstacles@{file}"
-    plans, states = write_some_demos(demo_path(task), task)
-    demos, robot = load_demos(task), load_robot(file)
-    for demo, plan, executed in zip(demos, plans, states, strict=True):
-        assert demo.plan.tobytes() == plan.tobytes()
-        np.testing.assert_allclose(demo.states, executed, rtol=0, atol=demos.quantum / 2 + 1e-6)
-        np.testing.assert_allclose(demo.configurations, robot.denormalise(demo.states))
-        assert demo.actions.shape == (len(executed) - 1, 6)
-    half = (robot.upper - robot.lower) / 2
-    lengths = [np.linalg.norm(np.diff(one, axis=0) * half, axis=1).sum() for one in states]
-    assert describe(demos)["path_length"] == pytest.approx(np.mean(lengths), rel=1e-3)
 
 
 @pytest.mark.parametrize("load", [load_queries, load_demos])

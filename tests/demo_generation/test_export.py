@@ -1,6 +1,7 @@
 """`roboarm export`: Minari's episodes are those of the environment; LeRobot's are the motions."""
 
 import dataclasses
+import functools
 import json
 
 import numpy as np
@@ -135,13 +136,17 @@ def test_errors_are_one_line(path, monkeypatch):
     assert 'pip install -e ".[minari]"' in error(file=path)
 
 
-def test_lerobot_dataset_has_the_motions_and_is_read_again(demos, path, tmp_path, capsys):
+def test_lerobot_dataset_has_the_motions_and_is_read_again(
+    demos, path, tmp_path, capsys, monkeypatch
+):
+    make = functools.partial(envs.make, render_size=(48, 36))
+    monkeypatch.setattr(export.envs, "make", make)
     folder, task = tmp_path / "wall_lerobot", "wall"
     export.main(export.Args("lerobot", file=path, output=folder, images=True))
     info = json.loads((folder / "meta" / "info.json").read_text())
     assert info["codebase_version"] == "v3.0" and info["fps"] == 30
     assert info["total_episodes"] == 3 and info["total_frames"] == len(demos.states)
-    assert info["features"]["observation.images.camera"]["shape"] == [360, 480, 3]
+    assert info["features"]["observation.images.camera"]["shape"] == [36, 48, 3]
     recordings = read_lerobot(folder, PANDA, JointNames(action="action"))
     for recording, demo in zip(recordings, demos, strict=True):
         np.testing.assert_allclose(recording.positions, demo.configurations, atol=1e-6)

@@ -1,15 +1,10 @@
 """Roadmaps: paths with a margin, labels of any configuration, and files that repeat exactly."""
 
-import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from paths import LIBRARY, ROOT
+from paths import LIBRARY
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.format import DatasetError
@@ -174,26 +169,6 @@ def test_files_do_not_depend_on_the_workers(collected, tmp_path):
 @pytest.mark.slow
 def test_cluster_makes_the_same_files(collected, tmp_path, cluster):
     collect(Args(tmp_path, **SMALL, ray_address=cluster.address), progress=False)
-    assert files(tmp_path) == files(collected)
-
-
-def test_interrupted_command_continues_to_the_same_files(collected, tmp_path):
-    flags = [f"--{k.replace('_', '-')}={v}" for k, v in SMALL.items()]
-    command = [sys.executable, "-m", "roboarm_nmp", "roadmaps", "--output", str(tmp_path), *flags]
-    process = subprocess.Popen(
-        command, cwd=ROOT, start_new_session=True, stderr=subprocess.PIPE, text=True
-    )
-    deadline = time.monotonic() + 100
-    while not shard_path(tmp_path, 0).exists():
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.02)
-    os.killpg(process.pid, signal.SIGTERM)
-    _, stderr = process.communicate()
-    assert process.returncode == 143 and "Traceback" not in stderr
-    assert stderr.splitlines()[-1] == "terminated; the same command continues from here"
-    written = shard_path(tmp_path, 0).stat().st_mtime_ns
-    collect(Args(tmp_path, **SMALL), progress=False)
-    assert shard_path(tmp_path, 0).stat().st_mtime_ns == written
     assert files(tmp_path) == files(collected)
 
 

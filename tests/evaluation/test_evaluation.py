@@ -273,29 +273,6 @@ def test_flags_change_the_filter_that_a_policy_includes(tmp_path, capsys):
     assert words in capsys.readouterr().out
 
 
-def test_safety_filter_around_a_network_without_link_distances(tmp_path):
-    source = "point_cloud"
-    path = _save(tmp_path / "policy.onnx")
-    few = {"split": "validation", "num_queries": 5}
-    bare = evaluate(path, "boxes", **few)
-    assert "link_distances" not in bare["env"] and bare["collision_rate"] > 0
-    result = evaluate(
-        path, "boxes", **few, safety_filter=SafetyFilter(margin=0.01), geometry_source=source
-    )
-    used = {"link_distances": True, "geometry_source": source}
-    assert result["env"] == bare["env"] | used
-    assert result["collision_rate"] < bare["collision_rate"]
-
-
-def test_planner_plans_from_the_observed_point_cloud():
-    truth, points = (
-        evaluate("planner", HARD, num_queries=8, split="validation", geometry_source=source)
-        for source in (None, "point_cloud")
-    )
-    assert truth["success_rate"] >= 0.75 and points["success_rate"] >= 0.75
-    assert truth["path_length"] != points["path_length"]
-
-
 # --- Ground truth
 
 FILTER = SafetyFilter(margin=0.01)

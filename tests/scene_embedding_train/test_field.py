@@ -1,16 +1,14 @@
-"""The trainer of the field: queries, symmetries, one update by hand, and a tiny overfit."""
+"""The trainer of the field: queries, symmetries, and one update by hand."""
 
 import copy
 
 import numpy as np
 import torch
-from encoder_trainers import check_learning, check_step, load, obstacle_rows, one_update
+from encoder_trainers import check_step, load, obstacle_rows, one_update
 from one_type import OneType
 
-from roboarm_nmp.datasets.observations import Observations
 from roboarm_nmp.envs.perception.encoders import MAX_OBSTACLES
-from roboarm_nmp.scene_embedding_train import clouds
-from roboarm_nmp.scene_embedding_train.obstacles import distances, load_obstacles
+from roboarm_nmp.scene_embedding_train.obstacles import distances
 
 field = load("field")
 
@@ -87,21 +85,6 @@ def test_one_update_follows_the_losses_written_out():
     torch.testing.assert_close(losses["loss"], total / weight)
     torch.testing.assert_close(losses["near"], near / count)
     check_step(model, before, total / weight, args.learning_rate)
-
-
-def test_field_overfits_a_few_scenes(observations):
-    torch.manual_seed(0)
-    read, rows = Observations(observations), np.arange(20)
-    args = field.Args(width=64, num_points=32)
-    model = field.Field(args)
-    data = [*clouds.load_obstacle_points(read, 32)[1:], load_obstacles(read)]
-    batch = field.batch_of(data, rows, "cpu")
-    queries = field.sample_queries(batch[2], 400, 0.05)
-
-    def error():
-        return field.evaluate(model, data, queries, rows, 20, "cpu")["error_20cm"]
-
-    check_learning(field, model, batch, (), args, error, updates=300)
 
 
 def test_no_kernel_receives_two_floating_point_types():

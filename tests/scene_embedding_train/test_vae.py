@@ -1,8 +1,7 @@
-"""The trainer of the VAE: one update by hand, and sizes of images."""
+"""The trainer of the VAE: one update by hand."""
 
 import copy
 
-import pytest
 import torch
 from encoder_trainers import check_step, load, one_update
 
@@ -31,13 +30,3 @@ def test_one_update_follows_the_losses_written_out():
     torch.testing.assert_close(losses["kl"], kl)
     torch.testing.assert_close(losses["loss"], error + 0.7 * kl)
     check_step(model, before, error + 0.7 * kl, args.learning_rate)
-
-
-@pytest.mark.parametrize(("size", "halvings"), [(112, 4), (16, 2), (8, 1)])
-def test_networks_fit_images_of_any_allowed_size(size, halvings):
-    assert vae.num_halvings(size) == halvings
-    args = vae.Args(width=2)
-    model = vae.VAE(4, size, args)
-    images = torch.rand(3, 4, 3, size, size)
-    assert model(images).shape == images.shape
-    assert model.encode(images)[0].shape == (3, 64)

@@ -1,13 +1,9 @@
-"""The trainer of the VQ-VAE: restarted codes, one update by hand, and a tiny overfit."""
+"""The trainer of the VQ-VAE: restarted codes, and one update by hand."""
 
 import copy
 
-import numpy as np
 import torch
-from encoder_trainers import check_learning, check_step, load, one_update
-
-from roboarm_nmp.datasets.observations import Observations
-from roboarm_nmp.scene_embedding_train import images
+from encoder_trainers import check_step, load, one_update
 
 vqvae = load("vqvae")
 
@@ -49,16 +45,3 @@ def test_one_update_follows_the_losses_written_out():
     torch.testing.assert_close(losses["commitment"], commitment)
     torch.testing.assert_close(losses["loss"], loss)
     check_step(model, before, loss, args.learning_rate)
-
-
-def test_vqvae_overfits_a_few_scenes(observations):
-    rows, args = np.arange(20), vqvae.Args(width=8)
-    read = Observations(observations)
-    model, (data, _) = vqvae.VQVAE(4, 16, args), images.load_images(read, 16)
-    mean_image = images.mean_of_images(data, 20, "cpu")
-
-    def error():
-        measured = (model, data, rows, mean_image, 20, "cpu")
-        return images.reconstruction_errors(*measured)["error_foreground"]
-
-    check_learning(vqvae, model, images.batch_of(data, rows, "cpu"), (mean_image,), args, error)

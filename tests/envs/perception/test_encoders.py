@@ -4,7 +4,6 @@ import copy
 import json
 import pickle
 from dataclasses import replace
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -188,23 +187,6 @@ def test_demonstrations_are_encoded_once_into_the_cache_folder(
     observed.clear()
     np.testing.assert_array_equal(encoder.encode_demos(demos), latents)
     assert len(observed) == 5
-
-
-def test_scenes_of_demonstrations_are_encoded_once_for_all_environments():
-    demos = replace(load_demos("random_boxes_hard"), start=np.zeros((5, 7)))  # the first 5
-    encoder = OracleEncoder()
-    with mock.patch.object(encoder, "_encode", wraps=encoder._encode) as encode:
-        first = encoder.encode_demos(demos)
-        np.testing.assert_array_equal(encoder.encode_demos(demos), first)
-    assert encode.call_count == 5
-
-
-@pytest.mark.parametrize("name", ["oracle", "point_cloud"])
-def test_latents_of_demonstrations_are_those_of_their_scenes(name):
-    demos = replace(load_demos("random_boxes_hard"), start=np.zeros((3, 7)))
-    latents = make_encoder(name).encode_demos(demos)
-    for z, scene in zip(latents, demos.scenes, strict=False):
-        np.testing.assert_array_equal(z, make_encoder(name)._encode(scene))
 
 
 # --- Copies

@@ -2,8 +2,8 @@
 
 import io
 import random
-import struct
 
+import cloud_examples
 import numpy as np
 from PIL import Image
 
@@ -11,14 +11,6 @@ from attacks.children import RAN, REFUSED
 from roboarm_nmp.datasets.cloud_files import CloudError, load_cloud
 from roboarm_nmp.envs.perception.point_clouds import prepare_cloud
 
-POINTS = np.random.default_rng(0).uniform(-0.8, 0.8, (40, 3)).astype(np.float32)
-ROWS = "\n".join(" ".join(map(str, point)) for point in POINTS)
-PLY = "ply\nformat {} 1.0\nelement vertex 40\n{}element face 0\nend_header\n"
-PROPERTIES = "".join(f"property float {axis}\n" for axis in "xyz")
-PCD = (
-    "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 40\nHEIGHT 1\n"
-    "VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 40\nDATA {}\n"
-)
 INTRINSICS = 20.0, 20.0, 4.0, 4.0
 # What replaces a number or a word of a header.
 ODD = (b"0", b"-1", b"1e9", b"99999999999", b"20000000", b"4294967296", b"nan", b"", b"x", b"f8")
@@ -36,38 +28,12 @@ ODD += (
 )
 
 
-def compressed(points):
-    """Data of a compressed PCD, in runs of at most 32 bytes as they are."""
-    fields = points.T.tobytes()
-    runs = [fields[i : i + 32] for i in range(0, len(fields), 32)]
-    data = b"".join(bytes([len(run) - 1]) + run for run in runs)
-    return struct.pack("<II", len(data), len(fields)) + data
-
-
 def files():
     """Contents of the files before changes: dict from the name to bytes."""
-    arrays = {"a.npy": POINTS, "f.npy": np.asfortranarray(np.float64(POINTS))}
     depth = io.BytesIO()
     pixels = np.random.default_rng(1).integers(0, 2000, (9, 9)).astype(np.uint16)
     Image.fromarray(pixels).save(depth, "PNG")
-    contents = {"depth.png": depth.getvalue()}
-    for name, array in arrays.items():
-        file = io.BytesIO()
-        np.save(file, array)
-        contents[name] = file.getvalue()
-    for name, save in (("a.npz", np.savez), ("c.npz", np.savez_compressed)):
-        file = io.BytesIO()
-        save(file, points=POINTS)
-        contents[name] = file.getvalue()
-    return contents | {
-        "text.ply": (PLY.format("ascii", PROPERTIES) + ROWS).encode(),
-        "little.ply": PLY.format("binary_little_endian", PROPERTIES).encode() + POINTS.tobytes(),
-        "big.ply": PLY.format("binary_big_endian", PROPERTIES).encode()
-        + POINTS.astype(">f4").tobytes(),
-        "text.pcd": (PCD.format("ascii") + ROWS).encode(),
-        "binary.pcd": PCD.format("binary").encode() + POINTS.tobytes(),
-        "compressed.pcd": PCD.format("binary_compressed").encode() + compressed(POINTS),
-    }
+    return cloud_examples.FILES | {"depth.png": depth.getvalue()}
 
 
 def damaged(contents, rng):
