@@ -199,7 +199,7 @@ def test_demonstration_as_transitions_by_hand(goal_type):
         np.testing.assert_allclose(entry["desired_goal"], goal, atol=1e-6)
     env.action_mode = "subgoal"
     sub_goals = demo_transitions(demo, env)
-    np.testing.assert_allclose(sub_goals[3]["action"], demo.states[4], atol=1e-6)
+    np.testing.assert_allclose(sub_goals[3]["action"], demo.states[3] + demo.actions[3], atol=1e-6)
     env.close()
 
 

@@ -101,7 +101,8 @@ def test_stopped_and_resumed_is_bit_identical_to_uninterrupted(
         assert torch.equal(one[key], other[key]), key
 
 
-@pytest.mark.parametrize("name", SCRIPTS)
+# (PointNet++ takes half a minute to export.)
+@pytest.mark.parametrize("name", ["vae", "vqvae", "field"])
 def test_update_evaluation_and_resume_run_on_another_device(
     name, observations, tmp_path, another_device
 ):

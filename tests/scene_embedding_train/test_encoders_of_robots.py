@@ -1,10 +1,9 @@
 """Observations and encoders of another arm than the Panda: xArm6."""
 
-import subprocess
-
 import pytest
 from encoder_trainers import command
 from paths import ROOT
+from trainers import error_here, run_here
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.format import DatasetError
@@ -38,14 +37,10 @@ def test_observations_are_of_their_arm(observations):
         Observations(observations)
 
 
-def test_encoder_is_for_its_arm(observations, tmp_path):
-    flags = ["--width", "8", "--latent-size", "8"]
-    without = subprocess.run(
-        command("field", observations, tmp_path, *flags), capture_output=True, text=True
-    )
-    assert without.returncode == 1 and "made for the robot 'xarm6' " in without.stderr
-    flags += ["--robot", str(XARM6)]
-    subprocess.run(command("field", observations, tmp_path, *flags), check=True)
+def test_encoder_is_for_its_arm(observations, tmp_path, capsys):
+    words = command("field", observations, tmp_path, "--latent-size", "8")[1:]
+    assert "made for the robot 'xarm6' " in error_here(capsys, *words)
+    run_here(*words, "--robot", XARM6)
     encoder = next(tmp_path.glob("*/encoder.onnx"))
     assert load_network(encoder).metadata["robot"] == ["xarm6", load_robot(XARM6).fingerprint]
     env = envs.make(f"random_boxes_hard@{XARM6}", encoder=encoder)

@@ -34,9 +34,7 @@ for _ in range(2):
 @pytest.mark.parametrize(
     "end, code, message",
     [
-        ("sys.exit(3)", 3, ""),
         ("envs.step_async(np.zeros(2, int)); sys.exit(3)", 3, ""),
-        ("envs.close()", 0, ""),
         ("os.kill(os.getpid(), signal.SIGKILL)", -9, ""),
         (KILL_ONE, 1, "error: a process with environments has died"),
     ],
