@@ -434,7 +434,7 @@ def test_arm_moves_within_limits_that_replace_the_urdfs(urdf, limit):
     np.testing.assert_allclose(angles, [2.5, -2.5], atol=0.01)
 
 
-@pytest.mark.parametrize("order", itertools.permutations("abc"), ids="".join)
+@pytest.mark.parametrize("order", list(itertools.permutations("abc")), ids="".join)
 def test_mimic_of_a_mimic_is_the_same_in_every_order_of_the_file(urdf, order):
     """Of three fingers, `a` follows `b`, which follows `c`."""
     limit = '<limit lower="0" upper="0.1" effort="50" velocity="2"/>'
