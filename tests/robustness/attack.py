@@ -23,7 +23,6 @@ SIZES = {
     "robots": (10_000, 1),
     "clouds": (10_000, 100),
     "problems": (10_000, 20),
-    "trajectories": (10_000, 200),
     "flags": (2_000, 1),
     "environments": (20_000, 100),
     "kills": (50, 1),

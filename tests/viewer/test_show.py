@@ -1,12 +1,10 @@
 """`roboarm show`: images and animations, the policy in them, and errors."""
 
 import os
-import re
 
 import numpy as np
 import pytest
 import torch
-from paths import ROOT
 from PIL import Image
 from torch import nn
 
@@ -105,16 +103,6 @@ def test_animation_shows_the_episode_of_a_policy(tmp_path, capsys, monkeypatch):
     with Image.open(tmp_path / "a.gif") as animation:
         assert 5 <= animation.n_frames <= 6
         assert animation.info["duration"] == pytest.approx(1000 * -(-steps // 5) / 30, abs=10)
-
-
-def test_first_animation_of_the_quickstart_is_collision_free(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    commands = re.findall(
-        r"^roboarm show (.* --output \S+\.gif)", (ROOT / "docs/quickstart.md").read_text(), re.M
-    )
-    assert run(*commands[0].split(), *SIZE) == 0
-    text = capsys.readouterr().out
-    assert "reached the goal" in text and "collision-free" in text
 
 
 def test_demonstration_is_shown(tmp_path, capsys):

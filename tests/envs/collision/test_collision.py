@@ -220,15 +220,6 @@ def test_depth_is_the_way_to_the_nearest_face(hulls, kind):
         np.testing.assert_allclose(normal, axes[ways.argmin()], atol=1e-3)
 
 
-def test_coinciding_centres_have_a_depth(hulls):
-    """GJK has no initial direction there."""
-    for link in range(len(LINKS)):
-        centre = (hulls[link].min(0) + hulls[link].max(0)) / 2
-        scene = Scene((Sphere(tuple(centre), 0.001),), table=None, floor=None)
-        near = CollisionChecker(scene).signed_distances(STATE, self_collisions=False)
-        assert near.distance[link] < -0.005
-
-
 def test_geometry_is_the_nearest_obstacle_table_floor_or_arm():
     scene = Scene((Sphere((5.0, 0, 0), 0.1), Sphere((0.9, 0, 0.5), 0.1)))
     states = np.zeros((3, 7))
