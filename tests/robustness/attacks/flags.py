@@ -31,6 +31,7 @@ RL += " --total-timesteps 60 --eval-every 60 --horizon 20"
 TINY = {
     "clean_rl_scripts.sac_her_mp": RL,
     "clean_rl_scripts.td3_her_mp": RL,
+    "clean_rl_scripts.crl_mp": RL,
     "bc_script.bc": f"--task wall --hidden-size 8 --batch-size 4 --num-demos 5 {RUN}"
     " --total-updates 4 --eval-every 4",
     "bc_script.roadmap_bc": f"--paths roadmaps --task wall --hidden-size 8 --token-width 8"
