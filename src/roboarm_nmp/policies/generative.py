@@ -8,9 +8,9 @@ from start to goal, plus curves with drawn coefficients. Each draw is repaired b
 away from observed points (`envs.collision.distance_field`), and checked in the observed cloud
 (`envs.collision.checker`). The shortest path that keeps the first of `MARGINS` is shortened and
 followed. Where no draw does, paths are drawn again from the best ones with new noise, then
-assembled from parts of all draws, then smaller margins do; last, where that is allowed, a path is
-searched for. Space that no sensor sees counts as occupied at first; where no path is found so, as
-free. Otherwise the arm follows the draw with the fewest contacts.
+assembled from parts of all draws, then smaller margins do. Space that no sensor sees counts as
+occupied; where no path is found so, all of this is done with that space as free. Last, where that
+is allowed, a path is searched for. Otherwise the arm follows the draw with the fewest contacts.
 """
 
 import numpy as np
