@@ -29,10 +29,11 @@ def query(_, rng):
     return READY, PANDA.denormalise(goal).astype(np.float32)
 
 
-TD3 = pytest.param("td3_her_mp", marks=pytest.mark.slow)  # it differs in its losses: test_updates
+# They differ in their losses: test_updates, test_crl_mp.
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("td3_her_mp", "crl_mp")]
 
 
-@pytest.mark.parametrize("trainer", ["sac_her_mp", TD3, "crl_mp"])
+@pytest.mark.parametrize("trainer", ["sac_her_mp", *SLOW])
 def test_trainer_learns_to_reach_near_goals(trainer, tmp_path, monkeypatch):
     make = functools.partial(envs.make, ee_tolerance=0.05)  # m
     monkeypatch.setattr(roboarm_nmp, "make", make)
