@@ -20,9 +20,9 @@ import numpy as np
 
 from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.point_clouds import (
+    DENSE_RAYS,
     FINE_POINT_RADIUS,
     POINT_CLOUD,
-    dense_observed_points,
     fine_observed_points,
     observed_points,
     without_known,
@@ -89,25 +89,19 @@ def observed_checker(scene: Scene) -> CollisionChecker:
 
 
 @functools.lru_cache(CACHED_FINE_CHECKERS)
-def fine_observed_checker(scene: Scene) -> CollisionChecker:
-    """As `observed_checker`, with more points and smaller balls; an `ObservedScene` has its own."""
+def fine_observed_checker(scene: Scene, num_rays: int | None = None) -> CollisionChecker:
+    """As `observed_checker`, with more points and smaller balls; an `ObservedScene` has its own.
+
+    `num_rays`: of each sensor; None for the usual 10,000, `DENSE_RAYS` to verify a whole path.
+    """
     if isinstance(scene, ObservedScene):
         return observed_checker(scene)
     radius = scale_of(scene.robot) * FINE_POINT_RADIUS
-    return _checker_of_points(scene, fine_observed_points(scene), radius)
-
-
-@functools.lru_cache(CACHED_FINE_CHECKERS)
-def dense_observed_checker(scene: Scene) -> CollisionChecker:
-    """As `fine_observed_checker`, of sensors with more rays: to verify a whole path."""
-    if isinstance(scene, ObservedScene):
-        return observed_checker(scene)
-    radius = scale_of(scene.robot) * FINE_POINT_RADIUS
-    return _checker_of_points(scene, dense_observed_points(scene), radius)
+    return _checker_of_points(scene, fine_observed_points(scene, num_rays), radius)
 
 
 def cautious_checker(scene: Scene, states: np.ndarray) -> CollisionChecker:
-    """As `dense_observed_checker`, but space that no sensor sees is occupied, too.
+    """As `fine_observed_checker` with `DENSE_RAYS`, but space that no sensor sees is occupied, too.
 
     Args:
         scene: the `Scene`.
@@ -115,9 +109,9 @@ def cautious_checker(scene: Scene, states: np.ndarray) -> CollisionChecker:
     """
     points = unseen_points(scene, states)
     if not len(points):
-        return dense_observed_checker(scene)
+        return fine_observed_checker(scene, DENSE_RAYS)
     radius = scale_of(scene.robot) * FINE_POINT_RADIUS
-    points = np.concatenate([dense_observed_points(scene), points])
+    points = np.concatenate([fine_observed_points(scene, DENSE_RAYS), points])
     return _checker_of_points(scene, points, radius)
 
 

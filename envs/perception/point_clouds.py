@@ -89,16 +89,9 @@ def remember_points(scene: Scene) -> None:
     _remembered[scene] = observed_points(scene)
 
 
-def fine_observed_points(scene: Scene) -> np.ndarray:
-    """As `observed_points`, one per cube of `FINE_CELL`."""
-    return _thin(scene, FINE_CELL)
-
-
-def dense_observed_points(scene: Scene) -> np.ndarray:
-    """As `fine_observed_points`, of sensors with `DENSE_RAYS` rays each."""
-    if isinstance(scene, ObservedScene):
-        return scene.points
-    return _thin(scene, FINE_CELL, DENSE_RAYS)
+def fine_observed_points(scene: Scene, num_rays: int | None = None) -> np.ndarray:
+    """As `observed_points`, one per cube of `FINE_CELL`. `num_rays`: as of `sensor_images`."""
+    return _thin(scene, FINE_CELL, num_rays)
 
 
 @functools.lru_cache(CACHED_SCENES)

@@ -23,9 +23,9 @@ from roboarm_nmp.envs.perception.encoders import make_encoder
 from roboarm_nmp.envs.perception.geometry_source import (
     Unknown,
     cautious_checker,
-    dense_observed_checker,
+    fine_observed_checker,
 )
-from roboarm_nmp.envs.perception.point_clouds import POINT_CLOUD, observed_points
+from roboarm_nmp.envs.perception.point_clouds import DENSE_RAYS, POINT_CLOUD, observed_points
 from roboarm_nmp.envs.subgoals import subgoals
 from roboarm_nmp.networks.network_file import Network
 from roboarm_nmp.networks.untrusted import NetworkError
@@ -88,7 +88,7 @@ class Generative:
             checkers.append(cautious_checker(scene, ends))
             path, verified = draw_path(draw, checkers[0], ends, rng)
         if not verified and self._unknown != "occupied":
-            checkers.append(dense_observed_checker(scene))
+            checkers.append(fine_observed_checker(scene, DENSE_RAYS))
             path, verified = draw_path(draw, checkers[-1], ends, rng)
         if not verified and self._search:
             searched = True
