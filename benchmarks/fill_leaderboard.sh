@@ -68,8 +68,6 @@ ompl ompl_rrt_connect "$both" "OMPL RRT-Connect" --function ompl_planners:rrt_co
   --link https://ompl.kavrakilab.org
 ompl bit_star "$both" "OMPL BIT*, 1 s" --function ompl_planners:bit_star \
   --link https://arxiv.org/abs/1405.5848
-ompl aorrtc "$both" "OMPL AORRTC, 1 s" --function ompl_planners:aorrtc \
-  --link https://arxiv.org/abs/2505.10542
 entry roboplan_rrt_star "$both" "roboplan RRT*" --function roboplan_rrt_star:begin --searches \
   --observes ground_truth --authors roboplan --licence MIT --link https://pypi.org/project/roboplan
 example trajectory_optimisation "$both" "optimised path, as by CHOMP" --searches \

@@ -16,6 +16,7 @@ from roboarm_nmp.envs.collision.distance_field import DistanceField, arm_spheres
 from roboarm_nmp.envs.perception.geometry_source import observed_checker
 from roboarm_nmp.envs.perception.point_clouds import observed_points
 from roboarm_nmp.envs.robots.panda import PANDA
+from roboarm_nmp.envs.subgoals import SUBGOAL_SPACING
 from roboarm_nmp.evaluation.evaluate import evaluate
 from roboarm_nmp.evaluation.rollout import rollout
 from roboarm_nmp.networks.network_file import load_network
@@ -137,6 +138,7 @@ def test_own_filter_leaves_a_verified_path_as_it_is_where_nothing_moves(run):
         assert verified
         actions[name] = rollout(env, query, act).actions
     assert np.array_equal(actions["own"], actions["none"])
+    assert np.linalg.norm(actions["own"][0]) < 0.6 * SUBGOAL_SPACING  # slowly at first
     assert not np.array_equal(actions["own"], actions["another"])
 
 

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from roboarm_nmp.envs.perception.geometry_source import cautious_checker, fine_observed_checker
+from roboarm_nmp.envs.perception.point_clouds import DENSE_RAYS
 from roboarm_nmp.envs.perception.visibility import are_seen, unobserved_share, unseen_points
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
@@ -31,4 +33,7 @@ def test_inside_of_a_closed_box_is_not_seen_and_space_around_it_is():
     assert (np.abs(around - CENTRE) < EDGE / 2).all(1).any()
     assert not are_seen(scene, around).any() and len(unseen_points(scene, START)) < len(around)
     states = rng.uniform(-1.0, 1.0, (200, 7))
+    free = fine_observed_checker(scene, DENSE_RAYS).is_free(states)
+    careful = cautious_checker(scene, observed).is_free(states)
+    assert not (careful & ~free).any() and careful.sum() < free.sum()
     assert unobserved_share(Scene(), states) < unobserved_share(scene, states) < 0.1
