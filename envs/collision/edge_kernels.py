@@ -32,6 +32,7 @@ from roboarm_nmp.envs.collision.block_kernels import (
     squared_length,
 )
 from roboarm_nmp.envs.collision.gjk_kernels import was_apart, write_body_row
+from roboarm_nmp.envs.collision.grid_kernels import offsets
 from roboarm_nmp.envs.collision.lanes_kernels import (
     WIDTH,
     lane,
@@ -288,10 +289,15 @@ def _against_points(margins, count, clearance, moves, arm32, world, grid, block)
         left = 0
         for i in range(outer_begin[k], outer_begin[k + 1]):
             x, y, z = _place_of(spheres, i)
-            store(own, 0, (x - place[0]) * place[3])
-            store(own, WIDTH, (y - place[1]) * place[3])
-            store(own, 2 * WIDTH, (z - place[2]) * place[3])
-            reaches = gaps + outer[i, 3]
+            x, y, z = (
+                (x - place[0]) * place[3],
+                (y - place[1]) * place[3],
+                (z - place[2]) * place[3],
+            )
+            store(own, 0, x)
+            store(own, WIDTH, y)
+            store(own, 2 * WIDTH, z)
+            reaches = gaps + outer[i, 3] + offsets(x, y, z, place)
             for n in range(WIDTH):
                 u, v, w = own[n], own[WIDTH + n], own[2 * WIDTH + n]
                 distance = place[4]  # outside of the grid

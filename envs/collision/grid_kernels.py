@@ -1,10 +1,18 @@
-"""A grid of lower bounds of the distance from a point cloud, for checks of motions."""
+"""Point clouds for collision checks: cubes, groups, and a grid of lower bounds of the distance."""
 
 import math
 
 import numpy as np
 
-from roboarm_nmp.envs.collision.lanes_kernels import WIDTH, load, smaller, store
+from roboarm_nmp.envs.collision.lanes_kernels import (
+    WIDTH,
+    load,
+    nearest_int,
+    root,
+    smaller,
+    spread,
+    store,
+)
 from roboarm_nmp.utils.numba_cache import compiled, uncounted
 
 _CELL = 0.03  # m
@@ -12,28 +20,153 @@ _MAX_CELLS = 1_000_000  # of a cloud that is spread out, cells are larger
 
 
 @compiled
-def distance_grid(points, farthest, within):
-    """Lower bounds of the distance of places from the nearest of points (n, 3), m.
+def first_in_cells(points, cell, count_around):
+    """The first of the points (n, 3), m, in each cube with edges of `cell`, m, of their type.
+
+    Returns, for the m cubes in the order of their first points: int64 (m,), the index of that
+    point; int32 (n,), the cube of each point; int64 (m,), how many points the cube and, with
+    `count_around`, the 26 around it have.
+    """
+    n, size = points.shape[0], 1024
+    while size < 2 * n:
+        size *= 2
+    table = np.full(size, -1, np.int32)  # a hash table of indices of cubes
+    cells, cubes = np.empty((n, 3), np.int64), np.empty(n, np.int32)
+    first, count = np.empty(n, np.int64), np.zeros(n, np.int64)
+    m = _find_cells(points, cell, table, cells, cubes, first, count)
+    if not count_around:
+        return first[:m], cubes, count[:m]
+    around = np.zeros(m, np.int64)
+    for n in range(m):
+        for i in range(27):
+            x = cells[n, 0] + i // 9 - 1
+            y = cells[n, 1] + i // 3 % 3 - 1
+            z = cells[n, 2] + i % 3 - 1
+            neighbour = table[_slot(table, cells, x, y, z)]
+            if neighbour >= 0:
+                around[n] += count[neighbour]
+    return first[:m], cubes, around
+
+
+@uncounted
+def _find_cells(points, cell, table, cells, cubes, first, count):
+    m = 0
+    for i in range(points.shape[0]):
+        x = int(math.floor(points[i, 0] / cell))
+        y = int(math.floor(points[i, 1] / cell))
+        z = int(math.floor(points[i, 2] / cell))
+        slot = _slot(table, cells, x, y, z)
+        if table[slot] < 0:
+            cells[m, 0], cells[m, 1], cells[m, 2], first[m] = x, y, z, i
+            table[slot] = m
+            m += 1
+        cubes[i] = table[slot]
+        count[cubes[i]] += 1
+    return m
+
+
+@uncounted
+def _slot(table, cells, x, y, z):
+    """Where a cell is in a hash table, or the empty place where it belongs."""
+    mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
+    mixed *= 0x1E3779B97F4A7C15
+    slot = (mixed ^ (mixed >> 29)) & (table.shape[0] - 1)
+    while True:
+        n = table[slot]
+        if n < 0 or (cells[n, 0] == x and cells[n, 1] == y and cells[n, 2] == z):
+            return slot
+        slot = (slot + 1) & (table.shape[0] - 1)
+
+
+@compiled
+def group_cubes(points, cubes, order, count, group):
+    """Points in groups of cubes, as `hulls.group_points` returns them.
 
     Args:
+        points: float64 (n, 3), m.
+        cubes: int32 (n,), the cube of each point.
+        order: int64 (m,), the cubes in the order in which their points are wanted.
+        count: int64 (m,), how many points each cube has.
+        group: int64 (m,), the group of each cube, ascending along `order`.
+    """
+    m = order.shape[0]
+    begins, arranged = np.empty(m, np.int64), np.zeros((points.shape[0], 5))
+    groups = np.empty((group[order[m - 1]] + 1 if m else 0, 6))
+    _arrange(points, cubes, order, count, begins, arranged)
+    first = 0
+    for i in range(1, m + 1):
+        if i == m or group[order[i]] != group[order[first]]:
+            last = order[i - 1]
+            begin, end = begins[order[first]], begins[last] + count[last]
+            _write_group(arranged, begin, end, groups, group[last])
+            first = i
+    return arranged, groups
+
+
+@uncounted
+def _arrange(points, cubes, order, count, begins, arranged):
+    n = 0
+    for i in range(order.shape[0]):
+        begins[order[i]] = n
+        n += count[order[i]]
+    for i in range(points.shape[0]):
+        j = begins[cubes[i]]
+        begins[cubes[i]] += 1
+        for axis in range(3):
+            arranged[j, axis] = points[i, axis]
+        arranged[j, 4] = j + 1
+    for i in range(order.shape[0]):
+        begins[i] -= count[i]
+        j, end = begins[i], begins[i] + count[i]
+        farthest = 0.0
+        for k in range(j + 1, end):
+            farthest = max(farthest, _squared(arranged, k, arranged, j))
+        arranged[j, 3], arranged[j, 4] = math.sqrt(farthest) + 1e-9, end
+
+
+@uncounted
+def _squared(rows, i, others, j):
+    x, y, z = rows[i, 0] - others[j, 0], rows[i, 1] - others[j, 1], rows[i, 2] - others[j, 2]
+    return x * x + y * y + z * z
+
+
+@uncounted
+def _write_group(points, begin, end, groups, g):
+    for axis in range(3):
+        low = high = points[begin, axis]
+        for i in range(begin, end):
+            low, high = min(low, points[i, axis]), max(high, points[i, axis])
+        groups[g, axis] = (low + high) / 2.0
+    farthest = 0.0
+    for i in range(begin, end):
+        farthest = max(farthest, _squared(points, i, groups, g))
+    groups[g, 3], groups[g, 4], groups[g, 5] = math.sqrt(farthest), begin, end
+
+
+@compiled
+def distance_grid(points, farthest, within):
+    """Lower bounds of the distance of cells' centres from points.
+
+    Args:
+        points: float64 (n, 5), of `group_cubes`: the bounds are those of the boxes around cubes.
         farthest: m; points farther from the origin do not count.
-        within: m; the bounds are at most this.
+        within: m; bounds matter up to this.
 
     Returns:
         `near`, float32, the bound of each cell, row-major; `numbers`, int64 (3,), of cells along x,
-        y, z; `place`, float32 (5,): where the first cell begins, cells per m, and the bound outside
-        of the grid. Without points there are no cells.
+        y, z; `place`, float32 (5,): where the first cell begins, cells per m, and what counts as
+        the bound of cells outside of the grid. Without points there are no cells.
     """
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        if x * x + y * y + z * z < farthest * farthest:
-            for axis in range(3):
-                low[axis] = min(low[axis], points[i, axis])
-                high[axis] = max(high[axis], points[i, axis])
+    boxes = np.empty((points.shape[0], 6))
+    number = _write_boxes(points, farthest, boxes)
     numbers, place = np.zeros(3, np.int64), np.zeros(5, np.float32)
-    if high[0] < low[0]:
+    if number == 0:
         return np.empty(0, np.float32), numbers, place
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for i in range(number):
+        for axis in range(3):
+            low[axis] = min(low[axis], boxes[i, axis])
+            high[axis] = max(high[axis], boxes[i, 3 + axis])
     volume = 1.0
     for axis in range(3):
         volume *= high[axis] - low[axis] + 2.0 * within
@@ -44,37 +177,76 @@ def distance_grid(points, farthest, within):
         numbers[axis] = int((high[axis] + reach - low[axis]) / cell) + 1
         place[axis] = low[axis]
     numbers[2] = max(numbers[2], WIDTH)
-    place[3], place[4] = 1.0 / cell, within
-    nx, ny, nz = numbers[0], numbers[1], numbers[2]
-    # Squared distances of the cells' centres.
-    near = np.full(nx * ny * nz, np.float32((within + cell) ** 2))
-    steps = int(reach / cell) + 1
-    ramp = np.arange(WIDTH).astype(np.float32)
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        if x * x + y * y + z * z >= farthest * farthest:
-            continue
-        u, v, w = (x - low[0]) / cell, (y - low[1]) / cell, (z - low[2]) / cell
-        first, last = max(int(w) - steps, 0), min(int(w) + steps + 1, nz)
-        for a in range(max(int(u) - steps, 0), min(int(u) + steps + 1, nx)):
-            for b in range(max(int(v) - steps, 0), min(int(v) + steps + 1, ny)):
-                across = ((a + 0.5 - u) ** 2 + (b + 0.5 - v) ** 2) * cell * cell
-                if across >= reach * reach:
-                    continue
-                row = (a * ny + b) * nz
-                for c in range(first, last, WIDTH):
-                    c = min(c, nz - WIDTH)
-                    _lower(near, row + c, across, c + 0.5 - w, cell, ramp)
-    # A place is at most half a cell's diagonal from its centre. (And 1 um for rounding.)
-    half = 0.5 * math.sqrt(3.0) * cell + 1e-6
-    for i in range(near.shape[0]):
-        near[i] = min(math.sqrt(near[i]) - half, within)
+    place[3], place[4] = 1.0 / cell, reach
+    near = np.full(numbers[0] * numbers[1] * numbers[2], np.float32(reach * reach))  # squared
+    along = np.empty(numbers[2] + WIDTH, np.float32)
+    for i in range(number):
+        _lower(boxes[i], low, cell, reach, numbers, along, near)
+    for i in range(near.shape[0]):  # (1 um for rounding)
+        near[i] = math.sqrt(near[i]) - np.float32(1e-6)
     return near, numbers, place
 
 
 @uncounted
-def _lower(near, begin, across, along, cell, ramp):
-    """Lower squared distances in a row of `WIDTH` cells to those from one point."""
-    there = (load(ramp, 0) + np.float32(along)) * np.float32(cell)
-    squared = there * there + np.float32(across)
-    store(near, begin, smaller(squared, load(near, begin)))
+def _write_boxes(points, farthest, boxes):
+    """Write the lower and upper corners of cubes' points; returns their number."""
+    number = i = 0
+    while i < points.shape[0]:
+        end, any_near = int(points[i, 4]), False
+        for axis in range(3):
+            boxes[number, axis], boxes[number, 3 + axis] = np.inf, -np.inf
+        for k in range(i, end):
+            x, y, z = points[k, 0], points[k, 1], points[k, 2]
+            if x * x + y * y + z * z < farthest * farthest:
+                any_near = True
+                for axis in range(3):
+                    boxes[number, axis] = min(boxes[number, axis], points[k, axis])
+                    boxes[number, 3 + axis] = max(boxes[number, 3 + axis], points[k, axis])
+        number += any_near
+        i = end
+    return number
+
+
+@uncounted
+def _lower(box, low, cell, reach, numbers, along, near):
+    """Lower squared distances of cells' centres to those from a box."""
+    ny, nz = numbers[1], numbers[2]
+    begin_a, end_a = _cells_near(box, low, cell, reach, numbers, 0)
+    begin_b, end_b = _cells_near(box, low, cell, reach, numbers, 1)
+    begin_c, end_c = _cells_near(box, low, cell, reach, numbers, 2)
+    begin_c = min(begin_c, nz - WIDTH)
+    for c in range(begin_c, end_c + WIDTH):
+        along[c] = _squared_gap(box, low, cell, 2, c)
+    for a in range(begin_a, end_a):
+        across = _squared_gap(box, low, cell, 0, a)
+        for b in range(begin_b, end_b):
+            squared = across + _squared_gap(box, low, cell, 1, b)
+            if squared >= reach * reach:
+                continue
+            row = (a * ny + b) * nz
+            for c in range(begin_c, end_c, WIDTH):
+                c = min(c, nz - WIDTH)
+                lowered = load(along, c) + spread(np.float32(squared))
+                store(near, row + c, smaller(lowered, load(near, row + c)))
+
+
+@uncounted
+def _cells_near(box, low, cell, reach, numbers, axis):
+    begin = int((box[axis] - low[axis] - reach) / cell)
+    end = int((box[3 + axis] - low[axis] + reach) / cell) + 1
+    return max(begin, 0), min(end, numbers[axis])
+
+
+@uncounted
+def _squared_gap(box, low, cell, axis, i):
+    at = low[axis] + (i + 0.5) * cell
+    gap = max(box[axis] - at, at - box[3 + axis], 0.0)
+    return gap * gap
+
+
+@uncounted
+def offsets(u, v, w, place):
+    """How far (m) places are from the centres of their cells; u, v, w: in cells, from the first."""
+    u, v, w = u - np.float32(0.5), v - np.float32(0.5), w - np.float32(0.5)
+    u, v, w = u - nearest_int(u), v - nearest_int(v), w - nearest_int(w)
+    return root(u * u + v * v + w * w) * (np.float32(1.0) / place[3])

@@ -32,6 +32,7 @@ from roboarm_nmp.envs.collision.arm_kernels import (
     SPHERE,
 )
 from roboarm_nmp.envs.collision.gjk_kernels import BULLET_MARGIN, CELLS, rows_of_primitives
+from roboarm_nmp.envs.collision.grid_kernels import first_in_cells, group_cubes
 from roboarm_nmp.envs.robots.body import body_alone, collision_elements
 from roboarm_nmp.envs.robots.robot import Link, Robot
 from roboarm_nmp.envs.robots.rotations import matrix
@@ -42,8 +43,8 @@ from roboarm_nmp.utils.files import temporary_file
 
 MAX_MARGIN = 0.5
 """m. Margins and radii of points must be smaller."""
-# Edge (m) of the cubes that group points.
-_GROUP_SIZE = 0.16
+# Edge (m) of the smaller cubes that group points, and how many are in a group along each axis.
+_CUBE_SIZE, _GROUP_CUBES = 0.04, 4
 
 
 @functools.lru_cache(64)
@@ -374,9 +375,11 @@ def group_points(points, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndar
     """Points in groups of neighbours, as the compiled functions take them. Raises ValueError.
 
     Returns:
-        `points`: float64 (n, 3), m. `groups`: float64 (g, 6): the centre (m) of a group, the
-        largest distance (m) of its points from the centre, the index of its first point, and the
-        index after its last. `ball`: float64 (1, `ROW`), a point as a shape.
+        `points`: float64 (n, 5): m, of the first point in each cube the largest distance (m) of
+        the cube's points from it (of others 0), and the index after the cube's last point (of
+        others the next one's). `groups`: float64 (g, 6): the centre (m) of a group, the largest
+        distance (m) of its points from the centre, the index of its first point, and the index
+        after its last. `ball`: float64 (1, `ROW`), a point as a shape.
     """
     points = np.asarray(points, dtype=np.float64)
     if not points.size and radius == 0.0:
@@ -387,23 +390,18 @@ def group_points(points, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndar
         raise ValueError(f"points must have shape (n, 3), got {points.shape}")
     if not (np.isfinite(points).all() and 0 <= radius < MAX_MARGIN):
         raise ValueError(f"points must be finite, with a radius in [0, {MAX_MARGIN}) m")
-    cells = np.floor(points / _GROUP_SIZE).astype(np.int64)
-    order = np.lexsort(cells.T[::-1])  # stable
-    points, cells = points[order], cells[order]
-    begins = np.ones(len(points), np.bool_)
-    begins[1:] = (cells[1:] != cells[:-1]).any(1)
-    first = np.flatnonzero(begins)
-    groups = np.empty((len(first), 6))
-    if len(first):
-        size = np.diff(first, append=len(points))
-        middle = (np.minimum.reduceat(points, first) + np.maximum.reduceat(points, first)) / 2
-        away = np.linalg.norm(points - np.repeat(middle, size, axis=0), axis=1)
-        groups[:, :3], groups[:, 3] = middle, np.maximum.reduceat(away, first)
-        groups[:, 4], groups[:, 5] = first, first + size
+    points = np.require(points, np.float64, ("C", "W"))
+    first, cubes, count = first_in_cells(points, _CUBE_SIZE, False)
+    cells = np.floor(points[first] / _CUBE_SIZE).astype(np.int64)
+    groups = cells // _GROUP_CUBES
+    order = np.lexsort((*cells.T[::-1], *groups.T[::-1]))
+    group = np.zeros(len(order), np.int64)
+    group[order[1:]] = (np.diff(groups[order], axis=0) != 0).any(1).cumsum()
+    points, groups = group_cubes(points, cubes, order, count, group)
     ball = np.zeros((1, ROW))
     ball[0, 0], ball[0, 16] = SPHERE, radius
     return points, groups, ball
 
 
-_NO_POINTS = np.empty((0, 3)), np.empty((0, 6)), np.zeros((1, ROW))
+_NO_POINTS = np.empty((0, 5)), np.empty((0, 6)), np.zeros((1, ROW))
 _NO_POINTS[2][0, 0] = SPHERE

@@ -83,12 +83,15 @@ def is_apart_from_points(bodies, vertices, cells, k, world, frames, centres, pos
     for g in range(groups.shape[0]):
         if box_gap(bodies, k, frames, centres, groups, g, pose) >= groups[g, 3] + gap:
             continue
-        for j in range(int(groups[g, 4]), int(groups[g, 5])):
-            if box_gap(bodies, k, frames, centres, points, j, pose) >= gap:
-                continue
-            begin_gjk(ball, 0, pose, s)
-            if gjk(vertices, cells, k, ball, 0, pose, s, gap, gap)[0] < gap:
-                return False
+        j = int(groups[g, 4])
+        while j < groups[g, 5]:
+            away = box_gap(bodies, k, frames, centres, points, j, pose)
+            if away < gap:
+                begin_gjk(ball, 0, pose, s)
+                if gjk(vertices, cells, k, ball, 0, pose, s, gap, gap)[0] < gap:
+                    return False
+            # The points of its cube are in a ball around it.
+            j = j + 1 if away < gap + points[j, 3] else int(points[j, 4])
     return True
 
 

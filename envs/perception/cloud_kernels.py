@@ -62,66 +62,6 @@ def label_points(points, low, high, rows, known_distance, q, arm_distance, arm, 
 
 
 @compiled
-def _slot(table, cells, x, y, z):
-    """Where a cell is in a hash table, or the empty place where it belongs."""
-    mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
-    mixed *= 0x1E3779B97F4A7C15
-    slot = (mixed ^ (mixed >> 29)) & (table.shape[0] - 1)
-    while True:
-        n = table[slot]
-        if n < 0 or (cells[n, 0] == x and cells[n, 1] == y and cells[n, 2] == z):
-            return slot
-        slot = (slot + 1) & (table.shape[0] - 1)
-
-
-@compiled
-def first_in_cells(points, cell, count_around):
-    """The first of the points (n, 3), m, in each cube with edges of `cell`, m, of their type.
-
-    Returns, for the m cubes in the order of their first points: int64 (m,), the index of that
-    point; int32 (n,), the cube of each point; int64 (m,), how many points the cube and, with
-    `count_around`, the 26 around it have.
-    """
-    cubes = np.empty(points.shape[0], np.int32)
-    table = np.full(1024, -1, np.int64)  # of indices of cubes; twice as many as fit into `cells`
-    cells = np.empty((512, 3), np.int64)
-    first = np.empty(512, np.int64)
-    count = np.zeros(512, np.int64)
-    m = 0
-    for i in range(points.shape[0]):
-        x = int(math.floor(points[i, 0] / cell))
-        y = int(math.floor(points[i, 1] / cell))
-        z = int(math.floor(points[i, 2] / cell))
-        slot = _slot(table, cells, x, y, z)
-        if table[slot] < 0:
-            if m == first.shape[0]:
-                cells = np.concatenate((cells, np.empty_like(cells)))
-                first = np.concatenate((first, np.empty_like(first)))
-                count = np.concatenate((count, np.zeros_like(count)))
-                table = np.full(4 * m, -1, np.int64)
-                for n in range(m):
-                    table[_slot(table, cells, cells[n, 0], cells[n, 1], cells[n, 2])] = n
-                slot = _slot(table, cells, x, y, z)
-            cells[m, 0], cells[m, 1], cells[m, 2], first[m] = x, y, z, i
-            table[slot] = m
-            m += 1
-        cubes[i] = table[slot]
-        count[cubes[i]] += 1
-    if not count_around:
-        return first[:m], cubes, count[:m]
-    around = np.zeros(m, np.int64)
-    for n in range(m):
-        for i in range(27):
-            x = cells[n, 0] + i // 9 - 1
-            y = cells[n, 1] + i // 3 % 3 - 1
-            z = cells[n, 2] + i % 3 - 1
-            neighbour = table[_slot(table, cells, x, y, z)]
-            if neighbour >= 0:
-                around[n] += count[neighbour]
-    return first[:m], cubes, around
-
-
-@compiled
 def farthest(points, chosen):
     """Write the points of `envs.perception.point_clouds.farthest_points` to `chosen` (k, 3).
 

@@ -19,12 +19,12 @@ from typing import NamedTuple
 import numpy as np
 
 from roboarm_nmp.envs.collision.checker import LINK_DISTANCE_RANGE
+from roboarm_nmp.envs.collision.grid_kernels import first_in_cells
 from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, arm_hulls, shape_rows
 from roboarm_nmp.envs.perception.cloud_kernels import (
     OF_ARM,
     OF_OBSTACLE,
     farthest,
-    first_in_cells,
     label_points,
 )
 from roboarm_nmp.envs.perception.sensors import (
@@ -117,7 +117,7 @@ def _clouds(scene: Scene, num_rays: int | None = None) -> np.ndarray:
 
 @functools.lru_cache(2)
 def sensor_images(
-    scene: Scene, num_rays: int | None = None
+    scene: Scene, num_rays: int | None
 ) -> list[tuple[PointCloud, np.ndarray, np.ndarray]]:
     """What the four sensors of a `Scene` see: each with its depth and classes (`cast`).
 

@@ -345,13 +345,15 @@ def mark_seen(points, view, depth, behind, seen):
     """
     height, width = depth.shape
     for i in range(points.shape[0]):
+        if seen[i]:
+            continue
         x, y, z = (
             points[i, 0] - view[EYE],
             points[i, 1] - view[EYE + 1],
             points[i, 2] - view[EYE + 2],
         )
         ahead = x * view[AXES + 6] + y * view[AXES + 7] + z * view[AXES + 8]
-        if seen[i] or ahead <= view[NEAREST]:
+        if ahead <= view[NEAREST]:
             continue
         right = (x * view[AXES] + y * view[AXES + 1] + z * view[AXES + 2]) / view[ACROSS]
         up = (x * view[AXES + 3] + y * view[AXES + 4] + z * view[AXES + 5]) / view[UPWARDS]

@@ -36,7 +36,7 @@ def are_seen(scene: Scene, points: np.ndarray) -> np.ndarray:
     """
     points = np.require(points, np.float64, ("C", "W"))
     seen = np.zeros(len(points), np.bool_)
-    for sensor, depth, _ in sensor_images(scene):
+    for sensor, depth, _ in sensor_images(scene, None):
         view = view_of(sensor, sensor.size)
         mark_seen(points, view, depth, TOLERANCE, seen)
     hidden = ~seen
