@@ -1,10 +1,13 @@
-"""A hook of MkDocs: records the site's replays, and shows each where a page has its mark.
+"""A hook of MkDocs: records the site's replays, and shows them, and notebooks, in the pages.
 
-The mark of the replay NAME is `<!-- replay: NAME -->`. A replay is recorded into docs/recordings
+A page shows the replay NAME where it has the mark `<!-- replay: NAME -->`. A replay is recorded into docs/recordings
 if it is not there yet; delete it to record it again. Without the extra `viewer`, the site has none.
+
+`<!-- notebook: examples/NAME.ipynb -->` shows the notebook's cells, without the first, its title.
 """
 
 import importlib.util
+import json
 import logging
 import re
 import subprocess
@@ -21,6 +24,7 @@ REPLAYS = {
     "moving_boxes": ["view", "moving_boxes_hard", "--policy", POLICY, "go-to-goal", "--query", "0"],
 }
 MARK = re.compile(r"<!-- replay: (\w+) -->")
+NOTEBOOK = re.compile(r"<!-- notebook: (\S+) -->")
 FRAME = """\
 <iframe src="{}" width="100%" height="480" style="border: 0" loading="lazy"></iframe>
 *A replay: drag to look from elsewhere.*"""
@@ -40,9 +44,19 @@ def on_pre_build(config):
             subprocess.run([*roboarm, *command, "--record", file], check=True)
 
 
+def cells_of(mark):
+    cells = []
+    for cell in json.loads(Path(mark[1]).read_text())["cells"][1:]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "code":
+            source = f"```python\n{source}\n```"
+        cells.append(source.replace("../docs/", "../"))
+    return "\n\n".join(cells)
+
+
 def on_page_markdown(markdown, page, config, files):
     def replay(mark):
         file = files.get_file_from_path(f"recordings/{mark[1]}.html")
         return FRAME.format(get_relative_url(file.url, page.url)) if file else mark[0]
 
-    return MARK.sub(replay, markdown)
+    return NOTEBOOK.sub(cells_of, MARK.sub(replay, markdown))

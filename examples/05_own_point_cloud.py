@@ -1,10 +1,10 @@
 """From a point cloud to a motion: a pretrained policy with its safety filter.
 
     python examples/05_own_point_cloud.py
-    python examples/05_own_point_cloud.py --points cloud.ply
+    roboarm show --cloud box.npy --trajectory motion.csv --output motion.png
 
-The file is a PLY, PCD, NPY or NPZ file in metres, in the frame of the robot's base: x forward, y to
-the left, z up. Without a file, the points are random ones in a box in front of the arm.
+With `--points` you give your own points: a PLY, PCD, NPY or NPZ file in metres, in the frame of the
+robot's base (x forward, y to the left, z up). Otherwise they are random points of a box.
 """
 
 import argparse
@@ -18,11 +18,11 @@ from roboarm_nmp.envs.collision.checker import CollisionChecker
 from roboarm_nmp.envs.perception.point_clouds import prepare_cloud
 from roboarm_nmp.envs.scenes.primitives import ObservedScene
 from roboarm_nmp.evaluation.rollout import rollout
+from roboarm_nmp.motions.trajectories import save_trajectory
 from roboarm_nmp.policies.registry import find_policy, make_policy
 
 POLICY = "roadmap-bc-combined-point_cloud-random_boxes_hard-s1"
-# Joint angles, rad: from the arm's left to its right.
-START = np.array([1.0, 0.4, 0.0, -1.8, 0.0, 2.2, 0.8], np.float32)
+START = np.array([1.0, 0.4, 0.0, -1.8, 0.0, 2.2, 0.8], np.float32)  # rad
 GOAL = np.array([-1.0, 0.4, 0.0, -1.8, 0.0, 2.2, 0.8], np.float32)
 
 
@@ -30,10 +30,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--points", help="file of a point cloud")
     args = parser.parse_args()
-    rng = np.random.default_rng(0)
-    cloud = rng.uniform((0.45, -0.05, 0.0), (0.65, 0.05, 0.6), (5000, 3)).astype(np.float32)
     if args.points:
         cloud = load_cloud(args.points)
+    else:
+        rng = np.random.default_rng(0)
+        cloud = rng.uniform((0.45, -0.05, 0.0), (0.65, 0.05, 0.6), (5000, 3)).astype(np.float32)
+        np.save("box.npy", cloud)
 
     # Points of the table, the floor and the arm at its start are removed.
     points, _ = prepare_cloud(cloud, configuration=START)
@@ -49,6 +51,7 @@ def main() -> None:
     trajectory = rollout(env, query, make_policy(policy, env)(0, query).act)
     reached = "reached" if trajectory.success else "not reached"
     print(f"goal {reached} in {len(trajectory)} steps")
+    save_trajectory("motion.csv", trajectory)
     near = checker.signed_distances(np.clip(trajectory.states, -1, 1), self_collisions=False)
     print(f"smallest distance from a point: {1000 * near.distance.min():.1f} mm")
 

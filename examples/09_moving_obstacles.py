@@ -1,9 +1,10 @@
 """Put an obstacle in motion, and let a planner plan again whenever its path is blocked.
 
     python examples/09_moving_obstacles.py
+    roboarm show moving.yaml --trajectory replanning.csv --output replanning.gif
     roboarm view moving.yaml --policy replanning go-to-goal
 
-Writes the scene, and prints how the straight motion and `replanning` do on one query.
+Writes the scene and two motions, one straight and one of `replanning`, and prints how they end.
 """
 
 import argparse
@@ -17,6 +18,7 @@ from roboarm_nmp.envs.scenes.files import save_scene
 from roboarm_nmp.envs.scenes.motions import Oscillation
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
 from roboarm_nmp.evaluation.rollout import rollout
+from roboarm_nmp.motions.trajectories import save_trajectory
 from roboarm_nmp.policies.registry import make_policy
 
 # Joint angles, rad: from the arm's left to its right.
@@ -49,6 +51,7 @@ def main() -> None:
         reached = "reached" if trajectory.success else "not reached"
         contact = "with contact" if trajectory.collides else "without contact"
         print(f"{name}: goal {reached} in {len(trajectory)} steps, {contact}")
+        save_trajectory(f"{name}.csv", trajectory)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,15 @@
 """The scripts in examples/ run as their docstrings say, and print what these say."""
 
+import json
 import re
+import shlex
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 from paths import ROOT
-from trainers import run_here
+from trainers import TINY_BC, roboarm, run_here
 
 import roboarm_nmp
 from roboarm_nmp.datasets.queries import load_queries
@@ -51,6 +53,21 @@ def run(tmp_path, monkeypatch, capsys):
 )
 def test_example_prints_what_it_did(run, example, arguments, printed):
     assert re.search(printed, run(example, *arguments.split()))
+
+
+def test_notebook_trains_and_shows_a_policy(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for cell in json.loads((ROOT / "examples" / "first_policy.ipynb").read_text())["cells"]:
+        source = "".join(cell["source"])
+        assert not cell.get("outputs")
+        if source.startswith("!roboarm "):
+            words = shlex.split(source.replace("\\\n", ""))
+            assert roboarm(*words[1:], *TINY_BC.split()).returncode == 0
+        elif cell["cell_type"] == "code":
+            exec(source.replace("num_queries=100", "num_queries=2"), names)
+    assert len(re.findall(r"reaches \d+% of the goals", capsys.readouterr().out)) == 2
+    assert len(names["trajectory"]) > 0 and names["picture"].size == (640, 480)
 
 
 def test_entry_of_the_example_is_verified(tmp_path, monkeypatch):
