@@ -1,9 +1,9 @@
 """A hook of MkDocs: records the site's replays, and shows them, and notebooks, in the pages.
 
-A page shows the replay NAME where it has the mark `<!-- replay: NAME -->`. A replay is recorded into docs/recordings
-if it is not there yet; delete it to record it again. Without the extra `viewer`, the site has none.
-
-`<!-- notebook: examples/NAME.ipynb -->` shows the notebook's cells, without the first, its title.
+A page shows the replay NAME where it has the mark `<!-- replay: NAME -->`. A replay is recorded
+into docs/recordings if it is not there yet; delete it to record it again. Without the extra
+`viewer`, the site has none. `<!-- notebook: examples/NAME.ipynb -->` shows the cells of a notebook,
+without the first one, its title.
 """
 
 import importlib.util
