@@ -17,6 +17,8 @@ TRAINERS = {
     "td3": ("clean_rl_scripts.td3_her_mp", "TD3 with HER and demonstrations"),
     "crl": ("clean_rl_scripts.crl_mp", "contrastive RL with hindsight and demonstrations"),
     "bc": ("bc_script.bc", "behavioural cloning of demonstrations"),
+    "gciql": ("bc_script.gciql", "offline goal-conditioned implicit Q-learning"),
+    "diffusion": ("bc_script.diffusion", "diffusion policy: chunks of actions, by denoising"),
     "roadmap-bc": ("bc_script.roadmap_bc", "imitation of roadmap paths: policies for new scenes"),
     "flow": ("bc_script.flow", "flow matching of whole paths, verified before the arm moves"),
     "vae": ("scene_embedding_train.vae", "scene encoder: VAE of camera images"),

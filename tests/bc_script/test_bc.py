@@ -87,8 +87,7 @@ def test_losses_are_logged_with_a_mixture_from_two_files(tmp_path, short_episode
     flags = ["--num-modes", "2", "--goal-type", "config", "--demos", path, path]
     flags += ["--total-updates", "1000", "--eval-every", "1000"]
     run = run_script("bc", tmp_path, *flags)
-    events = EventAccumulator(str(run))
-    events.Reload()
+    events = EventAccumulator(str(run)).Reload()
     losses = [event.value for event in events.Scalars("losses/negative_log_likelihood")]
     assert len(losses) == 1 and np.isfinite(losses).all()
     assert json.loads((run / "args.json").read_text())["demos"] == [path, path]

@@ -180,8 +180,7 @@ def test_stopped_and_resumed_run_is_bit_identical_and_evaluated_as_validated(
     flags = ["--paths", str(folder), "--encoder", "point_cloud", "--num-points", "8"]
     flags += ["--safety-margin", "0.012"]
     whole = run_script("roadmap_bc", tmp_path / "whole", *flags)
-    events = EventAccumulator(str(whole))
-    events.Reload()
+    events = EventAccumulator(str(whole)).Reload()
     for tag in ("success_rate", "collision_free_success_rate", "success_rate_without_filter"):
         assert [event.step for event in events.Scalars(f"eval/{tag}")] == [20, 40]
 

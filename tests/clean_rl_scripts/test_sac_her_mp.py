@@ -112,29 +112,20 @@ def test_relabelled_goals_are_reached_later_in_the_same_episode():
     # The rest of a transition stays together.
     np.testing.assert_array_equal(batch["observation"][:, 0], now)
     np.testing.assert_array_equal(batch["next_observation"][:, 3], now + 1)
-    # The future strategy: each later step of an episode is equally likely.
-    first = goal[now == 100]
-    counts = np.bincount((first - 100).astype(int), minlength=6)
-    assert abs(counts / len(first) - 1 / 6).max() < 0.06
 
 
-def test_goals_reached_soon_are_preferred():
+@pytest.mark.parametrize("exponent", [1.0, 2.0])
+def test_a_share_is_relabelled_and_goals_reached_soon_are_preferred(exponent):
     env = envs.make("no_obstacles")
-    buffer = make_buffer(env, 100, 1.0, her_exponent=2.0)
+    buffer = make_buffer(env, 100, 0.8, exponent)
     buffer.add_episode(episode(6, 0, env))
-    batch = buffer.sample(20_000)
+    batch = buffer.sample(50_000)
     goal = batch["desired_goal"][batch["next_achieved_goal"][:, 0] == 0, 0].astype(int)
+    goal, share = goal[goal != -5], (goal != -5).mean()
     # The square of a uniform number is below x with probability sqrt(x).
-    expected = np.diff(np.sqrt(np.arange(7) / 6))
+    expected = np.diff((np.arange(7) / 6) ** (1 / exponent))
     np.testing.assert_allclose(np.bincount(goal, minlength=6) / len(goal), expected, atol=0.03)
-
-
-def test_share_of_relabelled_goals():
-    env = envs.make("no_obstacles")
-    buffer = make_buffer(env, 100, 0.8)
-    buffer.add_episode(episode(20, 0, env))
-    goals = buffer.sample(10_000)["desired_goal"][:, 0]
-    assert abs((goals != -5).mean() - 0.8) < 0.02
+    assert share == pytest.approx(0.8, abs=0.03)
 
 
 def test_collisions_end_episodes_only_with_stop_on_collision_and_cost_what_they_should():

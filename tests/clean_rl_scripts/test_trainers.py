@@ -42,7 +42,11 @@ FINISHED = {
     "td3_her_mp": ["--goal-type", "config", "--action-mode", "subgoal", "--capture-video"],
     "crl_mp": ["--goal-type", "pose"],
     "bc": ["--goal-type", "pose", "--policy-average", "0.01"],
+    "gciql": ["--goal-type", "pose"],
+    "diffusion": ["--goal-type", "combined", "--num-blocks", "1"],
 }
+LOSSES = {"bc": ["negative_log_likelihood"], "diffusion": ["denoising_loss"]}
+LOSSES["crl_mp"] = ["critic_loss", "actor_loss"]
 
 
 @pytest.fixture(scope="module")
@@ -87,17 +91,14 @@ def test_run_writes_result_policy_and_tensorboard_events(finished_run, trainer):
     progress = torch.load(finished_run / "checkpoint.pt", weights_only=True)["progress"]
     assert (progress["evaluated"], progress["best_step"]) == (600, result["policy_step"])
 
-    events = EventAccumulator(str(finished_run))
-    events.Reload()
+    events = EventAccumulator(str(finished_run)).Reload()
     scalars = set(events.Tags()["scalars"])
-    losses = ["negative_log_likelihood"]
-    if trainer != "bc":
-        losses = ["critic_loss" if trainer == "crl_mp" else "qf_loss", "actor_loss"]
+    if "mp" in trainer:
         assert {
             f"charts/{tag}"
             for tag in ("episodic_return", "episodic_length", "success", "contact_share")
         } <= scalars
-    for tag in losses:
+    for tag in LOSSES.get(trainer, ["qf_loss", "actor_loss"]):
         assert math.isfinite(events.Scalars(f"losses/{tag}")[0].value)
     assert events.Scalars("charts/SPS")[0].value > 0
     for tag in RESULTS[:-1]:  # but for the mean steps of successes
@@ -123,7 +124,9 @@ def test_saved_policy_is_the_running_average_and_acts_without_the_script(
     env = envs.make(policy.metadata["task"], **policy.metadata["env"])
     observation, _ = env.reset(seed=0)
     inputs = {name: torch.tensor(value[None]) for name, value in observation.items()}
-    action = policy(**inputs)
+    if recurrent_size := policy.metadata.get("recurrent_size"):
+        inputs["recurrent_state"] = torch.zeros(1, recurrent_size)
+    action = policy(**inputs)[0] if recurrent_size else policy(**inputs)
     limit = 0.06 if "--action-mode" not in FINISHED[trainer] else 1.0
     assert action.shape == (1, 7) and action.abs().max() <= limit
     env.step(action[0].numpy())
@@ -157,7 +160,7 @@ def assert_same_checkpoints(*folders):
 
 
 @pytest.mark.parametrize("device", ["cpu", GPU])
-@pytest.mark.parametrize("name", ["sac_her_mp", "crl_mp", "bc"])
+@pytest.mark.parametrize("name", ["sac_her_mp", "crl_mp", "bc", "gciql", "diffusion"])
 def test_stopped_and_resumed_run_is_bit_identical_to_an_uninterrupted_one(
     tmp_path, name, device, finished_runs, short_episodes
 ):

@@ -50,14 +50,6 @@ def file(tmp_path_factory):
     return file
 
 
-def test_discount_factor_is_higher_where_a_joint_turns_all_the_way_round():
-    module = load("sac_her_mp")
-    for arm, discount in (("xarm6", 0.98), ("iiwa", 0.95)):
-        robot = load_robot(EXAMPLE.with_stem(arm))
-        assert module.discount_factor("auto", robot) == discount
-        assert module.discount_factor(0.9, robot) == 0.9
-
-
 @pytest.mark.parametrize("trainer", SHORT)
 def test_trainer_trains_another_arm(trainer, file, tmp_path, monkeypatch, short_episodes):
     monkeypatch.chdir(file.parent)
@@ -104,13 +96,14 @@ def test_exported_policy_names_its_arm(file, tmp_path):
         evaluate(tmp_path / "bad.onnx")
 
 
-def test_target_entropy_is_minus_the_number_of_joints(file):
-    sac, cpu = load("sac_her_mp"), torch.device("cpu")
-    xarm6 = envs.make(f"no_obstacles@{file}")
+def test_discount_factor_and_target_entropy_depend_on_the_joints(file):
+    sac = load("sac_her_mp")
+    xarm6 = envs.make(f"no_obstacles@{file}")  # its first joint turns all the way round
     for given, of_panda, of_xarm6 in (("auto", -7.0, -6.0), (-14.0, -14.0, -14.0), (None,) * 3):
         args = sac.Args(target_entropy=given, hidden_size=16)
-        assert sac.SAC(args, panda_env(), cpu).target_entropy == of_panda
-        assert sac.SAC(args, xarm6, cpu).target_entropy == of_xarm6
+        for env, entropy, gamma in ((panda_env(), of_panda, 0.95), (xarm6, of_xarm6, 0.98)):
+            agent = sac.SAC(args, env, torch.device("cpu"))
+            assert (agent.target_entropy, agent.gamma) == (entropy, gamma)
 
 
 def test_evaluate_command_takes_a_robot(file, capsys):

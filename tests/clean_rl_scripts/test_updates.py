@@ -1,4 +1,4 @@
-"""One update of SAC, TD3 and BC against independent formulas."""
+"""One update of SAC and TD3 against independent formulas."""
 
 import copy
 
@@ -10,7 +10,7 @@ from torch.distributions import Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
 from trainers import load, panda_env
 
-sac, td3, bc = load("sac_her_mp"), load("td3_her_mp"), load("bc")
+sac, td3 = load("sac_her_mp"), load("td3_her_mp")
 N = 64
 
 
@@ -198,23 +198,3 @@ def test_exploration_noise_of_td3_has_the_given_size():
     with torch.no_grad():
         noise = agent.explore(given)["actions"] - agent.actor.eval()(**given)
     assert 0.18 < noise.std() / 0.06 < 0.22 and noise.mean().abs() < 0.03 * 0.06
-
-
-def test_update_of_behavioural_cloning():
-    torch.manual_seed(1)
-    actor = bc.Actor(bc.Args(goal_type="ee", hidden_size=16, num_modes=1), panda_env())
-    optimizer = torch.optim.Adam(actor.parameters(), lr=0.01, fused=True)
-    data, old = batch(), copy.deepcopy(actor)
-    inputs = data["observation"], data["desired_goal"], data["action"] / 0.03
-    outputs = old.mlp(old.features(*inputs[:2]))
-    std = torch.exp(-5 + 3.5 * (torch.tanh(outputs[:, 7:14]) + 1))
-    expected = -Normal(outputs[:, :7], std).log_prob(inputs[2]).sum(1).mean()
-    given = dict(zip(("observation", "goal", "action"), inputs, strict=True))
-    (loss,) = bc.update(actor, optimizer, given).values()
-    torch.testing.assert_close(loss, expected, rtol=1e-4, atol=1e-4)
-    weights = [p for name, p in old.named_parameters()]
-    after = [p for name, p in actor.named_parameters()]
-    assert_adam_step(weights, after, expected, 0.01)
-    for _ in range(20):
-        (last,) = bc.update(actor, optimizer, given).values()
-    assert last < loss - 1

@@ -19,7 +19,7 @@ def test_tables_show_the_results_in_the_data_files(name):
     assert load("make_algorithm_pages").with_tables(text) == text
 
 
-@pytest.mark.parametrize("name", ["sac", "td3", "crl", "bc", "roadmap_bc"])
+@pytest.mark.parametrize("name", ["sac", "td3", "crl", "bc", "gciql", "diffusion", "roadmap_bc"])
 def test_flag_tables_show_the_defaults(name):
     Args = importlib.import_module(f"roboarm_nmp.{TRAINERS[name.replace('_', '-')][0]}").Args
     words, defaults = load("make_command_line").words, vars(Args())

@@ -24,11 +24,13 @@ PATHS = {
     "td3_her_mp": ROOT / "clean_rl_scripts" / "td3_her_mp.py",
     "crl_mp": ROOT / "clean_rl_scripts" / "crl_mp.py",
     "bc": ROOT / "bc_script" / "bc.py",
+    "gciql": ROOT / "bc_script" / "gciql.py",
+    "diffusion": ROOT / "bc_script" / "diffusion.py",
     "roadmap_bc": ROOT / "bc_script" / "roadmap_bc.py",
     "flow": ROOT / "bc_script" / "flow.py",
 }
 # Trainers of policies in fixed scenes.
-TRAINERS = ("sac_her_mp", "td3_her_mp", "crl_mp", "bc")
+TRAINERS = ("sac_her_mp", "td3_her_mp", "crl_mp", "bc", "gciql", "diffusion")
 NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="PyTorch sees no GPU here")
 GPU = pytest.param("cuda", marks=NO_GPU)  # a `--device`
 TINY = "--hidden-size 16 --batch-size 16 --updates-per-step 0.1 --learning-starts 200 --num-envs 3"
@@ -36,14 +38,12 @@ TINY += " --horizon 50 --eval-every 300 --eval-queries 2 --test-queries 2 --tota
 TINIER = f"{TINY} --horizon 20 --learning-starts 100 --eval-every 300 --total-timesteps 300"
 TINY_BC = "--hidden-size 16 --batch-size 16 --num-demos 20 --eval-every 300 --eval-queries 2"
 TINY_BC += " --test-queries 2 --total-updates 600"
-TINY_ROADMAP_BC = (
-    "--hidden-size 16 --token-width 16 --num-blocks 1 --batch-size 16 --first-scenes 2"
-)
-TINY_ROADMAP_BC += " --pool-scenes 4 --examples-per-scene 50 --updates-per-scene 10 --workers 0"
-TINY_ROADMAP_BC += " --total-updates 40 --eval-every 20 --eval-queries 2 --test-queries 1"
-TINY_FLOW = "--hidden-size 16 --token-width 16 --num-blocks 1 --batch-size 16 --first-scenes 2"
-TINY_FLOW += " --pool-scenes 4 --num-points 8 --updates-per-scene 10 --workers 0"
-TINY_FLOW += " --total-updates 40 --eval-every 20 --eval-queries 2 --test-queries 1"
+TINY_PATHS = "--hidden-size 16 --token-width 16 --num-blocks 1 --batch-size 16 --first-scenes 2"
+TINY_PATHS += " --pool-scenes 4 --updates-per-scene 10 --workers 0"
+TINY_PATHS += " --total-updates 40 --eval-every 20 --eval-queries 2 --test-queries 1"
+TINY_BY_TRAINER = dict.fromkeys(("bc", "gciql", "diffusion"), TINY_BC)
+TINY_BY_TRAINER["roadmap_bc"] = f"{TINY_PATHS} --examples-per-scene 50"
+TINY_BY_TRAINER["flow"] = f"{TINY_PATHS} --num-points 8"
 # For tests of what training leaves in the checkpoint: one evaluation, on one query.
 ONE_EVALUATION = ["--eval-every", "600", "--eval-queries", "1", "--test-queries", "0"]
 
@@ -83,7 +83,7 @@ def panda_env(goal_type="ee"):
 
 def command(trainer, folder, *flags):
     """A run of seconds; later flags win."""
-    tiny = {"bc": TINY_BC, "roadmap_bc": TINY_ROADMAP_BC, "flow": TINY_FLOW}.get(trainer, TINY)
+    tiny = TINY_BY_TRAINER.get(trainer, TINY)
     return [sys.executable, str(PATHS[trainer]), "--runs-dir", str(folder), *tiny.split(), *flags]
 
 

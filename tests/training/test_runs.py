@@ -340,8 +340,7 @@ def test_events_of_repeated_steps_are_hidden(parse, tmp_path):
             run.log({"loss": torch.full((2,), 10.0 * first + run.step), "nothing": None})
         run.close()
         time.sleep(1.1)  # TensorBoard orders files by their names, which have the second
-    events = EventAccumulator(str(folder))
-    events.Reload()
+    events = EventAccumulator(str(folder)).Reload()
     found = [(event.step, event.value) for event in events.Scalars("loss")]
     assert found == [(1, 1), (2, 2), (3, 23), (4, 24), (5, 25)]
     table = events.Tensors("hyperparameters/text_summary")[0].tensor_proto.string_val[0].decode()
