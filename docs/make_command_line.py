@@ -68,11 +68,12 @@ replays all of it, and `roboarm benchmark table FOLDER` prints the table of veri
 | `--output` |  | folder of the entry |
 | `--tasks` | all of the tracks but MotionBenchMaker's | tasks to run |
 | `--problems` |  | folder of MotionBenchMaker's sets, a file SET.h5 each |
-| `--num-queries` | `1000` | test queries of each task |
+| `--num-queries` | `1000` | queries of each task |
 | `--quick` | `no` | 50 queries of each task |
+| `--split` | `test` | `validation` to choose something by; entries are of test queries |
 | `--workers` | cores | processes |
 | `--seed` | `0` | of the method's random numbers |
-| `--observes` |  | what the method is given of the scene |
+| `--observes` | `nothing`, or the policy's own | what the method is given of the scene |
 | `--searches` | `no` | the method searches for paths |
 | `--safety-margin` |  | m, of a safety filter around the policy; 0 for none |
 | `--search` | `no` | a policy that draws paths searches where it can verify none |

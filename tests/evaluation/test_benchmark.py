@@ -113,7 +113,12 @@ def test_interrupted_run_continues_and_another_method_is_refused(entry, capsys):
     assert benchmark.main([*run, "go-to-goal"]) == 0
     assert (entry / "double_walls.h5").stat().st_mtime_ns == before
     assert benchmark.main([*run, "random"]) == 1
-    assert "holds a submission of 'go-to-goal'" in capsys.readouterr().err
+    assert (
+        "begun otherwise, use another --output: method is 'go-to-goal'" in capsys.readouterr().err
+    )
+    assert benchmark.main([*run, "go-to-goal", "--observes", "point_cloud"]) == 1
+    assert benchmark.main([*run, "go-to-goal", "--num-queries", "7"]) == 1
+    assert "double_walls.h5 has 6 queries, not 7: delete it" in capsys.readouterr().err
 
 
 def test_smallest_change_of_an_action_is_found_and_its_query_named(copy):
@@ -173,6 +178,13 @@ def test_function_observes_points_and_its_motion_is_free_more_often(monkeypatch)
     assert field["collision_rate"] < straight["collision_rate"]
 
 
+START = [0, 0, 0, -1, 0, 1, 0]
+
+
+def path(waypoints):
+    return f"print('{{\"path\": {waypoints}}}')"
+
+
 def test_program_follows_its_path():
     method = ProgramMethod(f"{sys.executable} {EXAMPLES / 'straight_line.py'}")
     result = evaluate(method, "double_walls", num_queries=6)
@@ -183,9 +195,13 @@ def test_program_follows_its_path():
 @pytest.mark.parametrize(
     "answer, message",
     [
-        ("print('{\"action\": [0]}')", "action: must be 7 finite numbers"),
-        ("print('hello')", "its answer is not JSON"),
-        ("print('{\"path\": [[0, 0, 0, 0, 0, 0, NaN]]}')", "path: must be k x 7 finite numbers"),
+        ("print('{}' if 'start' in line else '{\"action\": [0]}')", "action: must be 7 finite"),
+        ("print('{\"action\": [0]}')", "its answer to a problem has action, must have `path`"),
+        ("print('hello')", "its answer is not one line of JSON: 'hello'; messages belong on"),
+        ("print('{}\\n{}')", "it printed more than one line for a question: '{}'"),
+        ("print('{\"path\": [[0, 0, 0, 0, 0, 0, NaN]]}')", "path: must have 2 to 10,000 waypoints"),
+        (path(f"[{START}, [0, 0]]"), "waypoint 1: must be 7 finite numbers"),
+        (path(f"[{START}, [90, 0, 0, -1, 0, 1, 0]]"), "waypoint 1 is outside .* joint 1 at 90 rad"),
         ("sys.exit(3)", r"ended without an answer \(exit code 3\)"),
     ],
 )

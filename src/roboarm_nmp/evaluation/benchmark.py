@@ -12,6 +12,7 @@ docs/benchmark/enter.md explains the rules, the files and what a method is given
 import argparse
 import os
 import platform
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -79,8 +80,12 @@ def _parser() -> argparse.ArgumentParser:
         help="by default all tracks but MotionBenchMaker's",
     )
     run.add_argument("--problems", **problems)
-    run.add_argument("--num-queries", type=int, default=1000, help="test queries of each task")
+    run.add_argument("--num-queries", type=int, default=1000, help="queries of each task")
     run.add_argument("--quick", action="store_true", help=f"{QUICK} queries of each task")
+    run.add_argument(
+        "--split", choices=("test", "validation"), default="test",
+        help="`validation` to choose something by; entries are of test queries",
+    )  # fmt: skip
     run.add_argument("--workers", **workers)
     run.add_argument("--seed", type=int, default=0, help="of the method's random numbers")
     run.add_argument(
@@ -134,9 +139,13 @@ def _run(options: argparse.Namespace) -> int:
         known = (*TASKS, *PROBLEM_SETS)
         if task not in known:
             raise SubmissionError(f"no such task: {task}: {suggest(task, known)}")
+        if task not in (*ALL_TASKS, *PROBLEM_SETS):
+            print(f"{task}: not in the benchmark, so in no table", file=sys.stderr)
     policy, arguments, observes, searches, privileged = _method(options)
     description = {
         "method": options.name or str(policy),
+        "command": _command(options),
+        "split": options.split,
         "authors": options.authors,
         "link": options.link,
         "observes": observes,
@@ -165,6 +174,20 @@ def _run(options: argparse.Namespace) -> int:
         print(f"{task:<24} success {rates[0]:.3f}, collision-free {rates[1]:.3f}")
     print(f"{options.output}: verify it with `roboarm benchmark verify {options.output}`")
     return 0
+
+
+def _command(options: argparse.Namespace) -> str:
+    """The flags that decide what the method does."""
+    flags = []
+    for name in (
+        *("policy", "function", "program", "observes", "safety_margin", "search", "pose_goals"),
+        "seed",
+    ):
+        value = getattr(options, name)
+        if value is not None and value is not False:
+            flags.append(f"--{name.replace('_', '-')}")
+            flags += [] if value is True else [str(value)]
+    return shlex.join(flags)
 
 
 def _method(options) -> tuple[str | Method, dict[str, Any], str, bool, bool]:
@@ -225,6 +248,8 @@ def _processor() -> str:
 
 def _verify(options: argparse.Namespace) -> int:
     code = 0
+    if options.row is not None and (len(options.folders) > 1 or not options.row.parent.is_dir()):
+        raise SubmissionError("--row: a file in a folder that exists, for one submission")
     for folder in options.folders:
         try:
             row = verify_submission(

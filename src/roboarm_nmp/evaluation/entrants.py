@@ -11,8 +11,11 @@ JSON, a line each (docs/benchmark/enter.md). A joint path is followed with one s
 
 import contextlib
 import json
+import os
 import pkgutil
+import select
 import shlex
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -30,10 +33,13 @@ from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.policies.baselines import follow_path
 from roboarm_nmp.policies.policy import BeginEpisode, EpisodePolicy, Method
 from roboarm_nmp.policies.pose_goals import observed_at_start
+from roboarm_nmp.utils.progress import write_line
 
 Observes = Literal["nothing", "point_cloud", "ground_truth"]
 MAX_LINE = 10_000_000  # bytes of a program's answer
 MAX_WAYPOINTS = 10_000
+BEYOND_LIMITS = 0.01  # rad, of a waypoint: rounding, and what the arm is held back from
+PATIENCE = 30.0  # s, until a program's silence is mentioned
 
 
 class EntrantError(ValueError):
@@ -118,7 +124,8 @@ class FunctionMethod(Method):
                 return EpisodePolicy(None, plan_found=False)
             if not isinstance(answer, (np.ndarray, list)):
                 return EpisodePolicy(answer)
-            return EpisodePolicy(follow_path(_checked_path(answer, env.robot), env.robot), True)
+            path = _checked_path(answer, env.robot, self.name)
+            return EpisodePolicy(follow_path(path, env.robot), True)
 
         return begin_function
 
@@ -140,50 +147,102 @@ class ProgramMethod(Method):
 
     def begin(self, env: RoboArmEnv, seed: int) -> BeginEpisode:
         """As of `Method`. Raises EntrantError: the program cannot be started."""
-        try:
-            program = subprocess.Popen(
-                shlex.split(self.command), stdin=subprocess.PIPE, stdout=subprocess.PIPE
-            )
-        except (OSError, ValueError) as error:
-            raise EntrantError(f"{self.command}: cannot be started: {error}") from error
+        program = _Program(self.command)
         joints = env.robot.num_joints
 
         def act(observation: Any) -> np.ndarray:
             arrays = {name: array.tolist() for name, array in observation.items()}
-            answer = self._ask(program, {"observation": arrays})
-            return _numbers(answer.get("action"), (joints,), f"{self.command}: action")
+            answer = program.ask({"observation": arrays})
+            return _numbers(answer.get("action"), joints, f"{self.command}: action")
 
         def begin_program(number: int, query: Query) -> EpisodePolicy:
             problem = _problem(env, number, query, self.observes, seed)
-            answer = self._ask(program, _message(problem))
-            if "path" not in answer:
+            answer = program.ask(_message(problem))
+            if answer == {}:
                 return EpisodePolicy(act)
+            if "path" not in answer:
+                raise EntrantError(
+                    f"{self.command}: its answer to a problem has {', '.join(answer)}, must have "
+                    "`path`, or be {} to act step by step"
+                )
             if answer["path"] is None:
                 return EpisodePolicy(None, plan_found=False)
-            return EpisodePolicy(follow_path(_checked_path(answer["path"], env.robot), env.robot))
+            path = _checked_path(answer["path"], env.robot, self.command)
+            return EpisodePolicy(follow_path(path, env.robot))
 
         return begin_program
 
-    def _ask(self, program, message) -> dict[str, Any]:
-        """The program's answer to a message."""
+
+class _Program:
+    """A running program, which answers each line with a line. Raises EntrantError if it doesn't."""
+
+    def __init__(self, command: str):
+        self.command = command
+        self.is_patient = True
         try:
-            program.stdin.write(json.dumps(message).encode() + b"\n")
-            program.stdin.flush()
-            line = program.stdout.readline(MAX_LINE)
+            self.process: Any = subprocess.Popen(
+                shlex.split(command), bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            )
+        except (OSError, ValueError) as error:
+            raise EntrantError(f"{command}: cannot be started: {error}") from error
+
+    def ask(self, message: dict[str, Any]) -> dict[str, Any]:
+        """Its answer to a message."""
+        if select.select([self.process.stdout], [], [], 0.0)[0]:
+            self._check_end(self._read())
+        try:
+            self.process.stdin.write(json.dumps(message).encode() + b"\n")
         except OSError:
-            line = b""
-        if not line:
-            code = None
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                code = program.wait(5)
-            raise EntrantError(f"{self.command}: ended without an answer (exit code {code})")
+            self._fail_ended()
+        line = b""
+        while not line.endswith(b"\n"):
+            part = self._read()
+            end = part.find(b"\n") + 1
+            self._check_end(part[end:] if end else b"")
+            line += part
+            if len(line) > MAX_LINE:
+                raise EntrantError(f"{self.command}: its answer is longer than {MAX_LINE:,} bytes")
         try:
             answer = json.loads(line)
         except (ValueError, RecursionError) as error:
-            raise EntrantError(f"{self.command}: its answer is not JSON: {line[:80]!r}") from error
+            text = line[:80].decode(errors="replace").strip()
+            raise EntrantError(
+                f"{self.command}: its answer is not one line of JSON: {text!r}; messages belong on "
+                "standard error"
+            ) from error
         if not isinstance(answer, dict):
             raise EntrantError(f"{self.command}: its answer is no JSON object: {line[:80]!r}")
         return answer
+
+    def _read(self) -> bytes:
+        """Some of its output."""
+        stdout = self.process.stdout
+        if self.is_patient and not select.select([stdout], [], [], PATIENCE)[0]:
+            self.is_patient = False  # it is mentioned once
+            write_line(
+                f"{self.command}: no answer for {PATIENCE:.0f} s; does it flush its standard "
+                "output after each line?"
+            )
+        part = os.read(stdout.fileno(), 2**16)
+        return part or self._fail_ended()
+
+    def _check_end(self, rest: bytes) -> None:
+        if rest:
+            text = rest[:80].decode(errors="replace").strip()
+            raise EntrantError(
+                f"{self.command}: it printed more than one line for a question: {text!r}; messages "
+                "belong on standard error"
+            )
+
+    def _fail_ended(self) -> Any:
+        code = None
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            code = self.process.wait(5)
+        how = f"exit code {code}"
+        if code is not None and code < 0:
+            how = f"killed by {signal.Signals(-code).name}"
+        advice = "; it must read on until its standard input ends" if code == 0 else ""
+        raise EntrantError(f"{self.command}: ended without an answer ({how}){advice}")
 
 
 def _message(problem: Problem) -> dict[str, Any]:
@@ -207,24 +266,31 @@ def _message(problem: Problem) -> dict[str, Any]:
     return message
 
 
-def _checked_path(path: Any, robot: Robot) -> np.ndarray:
+def _checked_path(path: Any, robot: Robot, method: str) -> np.ndarray:
     """A joint path (k, n), rad, as float32. Raises EntrantError: it is none."""
-    path = _numbers(path, (None, robot.num_joints), "path").astype(np.float32)
-    if not 2 <= len(path) <= MAX_WAYPOINTS:
-        raise EntrantError(f"path: {len(path)} waypoints, must have 2 to {MAX_WAYPOINTS:,}")
-    return path
+    if not isinstance(path, (list, np.ndarray)) or not 2 <= len(path) <= MAX_WAYPOINTS:
+        raise EntrantError(f"{method}: path: must have 2 to {MAX_WAYPOINTS:,} waypoints")
+    waypoints = []
+    for i, waypoint in enumerate(path):
+        what = f"{method}: waypoint {i}"
+        angles = _numbers(waypoint, robot.num_joints, what)
+        beyond = np.maximum(robot.lower - angles, angles - robot.upper)
+        if beyond.max() > BEYOND_LIMITS:
+            joint = int(beyond.argmax())
+            raise EntrantError(
+                f"{what} is outside the limits, joint {joint + 1} at {angles[joint]:.4g} rad: "
+                "is it in degrees, or in another order of the joints?"
+            )
+        waypoints.append(angles)
+    return np.array(waypoints, np.float32)
 
 
-def _numbers(value: Any, shape: tuple[int | None, ...], what: str) -> np.ndarray:
-    """An array of finite numbers. Raises EntrantError: it is none, or has another shape."""
+def _numbers(value: Any, count: int, what: str) -> np.ndarray:
+    """An array (count,) of finite numbers, float64. Raises EntrantError: it is none."""
     try:
-        array = np.asarray(value, np.float64)
-    except (TypeError, ValueError) as error:
-        raise EntrantError(f"{what}: {error}") from error
-    fits = len(array.shape) == len(shape) and all(
-        size in (None, length) for size, length in zip(shape, array.shape, strict=True)
-    )
-    if not fits or not np.isfinite(array).all():
-        words = " x ".join("k" if size is None else str(size) for size in shape)
-        raise EntrantError(f"{what}: must be {words} finite numbers, got {str(value)[:60]}")
-    return array
+        array = np.asarray(value)
+    except ValueError:  # lists of different lengths
+        array = np.array(None)
+    if array.shape != (count,) or array.dtype.kind not in "iuf" or not np.isfinite(array).all():
+        raise EntrantError(f"{what}: must be {count} finite numbers, got {str(value)[:60]}")
+    return array.astype(np.float64)

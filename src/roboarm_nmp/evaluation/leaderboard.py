@@ -58,8 +58,13 @@ def _read_row(path: Path) -> dict[str, Any]:
         row = plain_data(load_document(path, allow_tags=False))
         row["tasks"] = dict(row["tasks"])
         row["method"] = str(row["method"])
+        verified = all("success_rate_interval" in numbers for numbers in row["tasks"].values())
     except (DocumentError, TypeError, KeyError, AttributeError) as error:
         raise SubmissionError(f"{path}: no row of the benchmark: {error}") from error
+    if not verified:
+        raise SubmissionError(
+            f"{path}: not a verified row: make it with `roboarm benchmark verify ENTRY --row FILE`"
+        )
     return row
 
 

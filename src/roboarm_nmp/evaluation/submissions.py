@@ -10,6 +10,7 @@ actions and compares. docs/reference/file_formats.md describes the files.
 
 import functools
 import hashlib
+import importlib.metadata
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -64,6 +65,9 @@ PROBLEM_SETS = TRACKS["MotionBenchMaker"]
 SCHEMA, VERSION = "roboarm-nmp benchmark actions", 1
 DESCRIPTION = {
     "method": str,
+    "command": str,
+    "split": str,
+    "versions": str,
     "authors": str,
     "link": str,
     "observes": str,
@@ -76,6 +80,8 @@ DESCRIPTION = {
     "training_seeds": int,
 }
 """What a submission says about its method, and the types."""
+FIXED = ("method", "command", "split", "observes", "searches", "privileged", "versions")
+"""What stays the same while a submission is continued."""
 OBSERVES = ("nothing", "point cloud", "latent code", "ground truth")
 MAX_QUERIES = 10_000
 CHUNK = 10  # queries that a worker verifies at a time
@@ -128,13 +134,17 @@ class TaskActions:
         return self.actions[self.offsets[i] : self.offsets[i + 1]]
 
 
-def benchmark_queries(task: str, problems: str | Path | None = None) -> Queries | Problems:
+def benchmark_queries(
+    task: str, problems: str | Path | None = None, split: str = "test"
+) -> Queries | Problems:
     """The queries of a task; of a set of problems, those in `problems`/TASK.h5.
 
     Raises SubmissionError: the set is not there, or some of its problems cannot be used.
     """
     if task not in PROBLEM_SETS:
-        return load_queries(task)
+        return load_queries(task, split)
+    if split != "test":
+        raise SubmissionError(f"{task}: a set of problems has no {split} queries")
     if problems is None:
         raise SubmissionError(f"{task}: needs MotionBenchMaker's problems (--problems FOLDER)")
     try:
@@ -156,6 +166,12 @@ def queries_digest(queries: Queries | Problems) -> str:
     return digest.hexdigest()
 
 
+def versions() -> str:
+    """The versions that a replay depends on."""
+    names = ("roboarm-nmp", "pybullet", "numpy")
+    return ", ".join(f"{name} {importlib.metadata.version(name)}" for name in names)
+
+
 # --- Writing
 
 
@@ -169,15 +185,15 @@ def write_submission(
     problems: str | Path | None = None,
     **options: Any,
 ) -> dict[str, Any]:
-    """Run a method on the first test queries of tasks, and write its submission.
+    """Run a method on the first queries of tasks, and write its submission.
 
-    Tasks that are in the folder already are left as they are, so an interrupted run continues.
+    Tasks that are in the folder already are kept, so an interrupted run continues.
 
     Args:
         folder: is made if there is none.
         policy, options: as of `roboarm_nmp.evaluate`.
-        description: values of `DESCRIPTION`; `observes` and `privileged` are filled in for policies
-            by name.
+        description: values of `DESCRIPTION` without `versions`; `split` is `test` or, to choose
+            something, `validation`.
         tasks: names of tasks.
         num_queries: of each task, at most; a set of problems may have fewer.
         progress: show a progress bar.
@@ -188,27 +204,37 @@ def write_submission(
 
     Raises:
         EvaluationError: as of `evaluate`.
-        SubmissionError: the folder holds another method's submission.
+        SubmissionError: the folder holds a submission of another method, or of the same one that
+            was run otherwise.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    document = {**description, "tasks": {}}
+    document = {**description, "versions": versions(), "tasks": {}}
     if (folder / "submission.yaml").exists():
-        document = read_description(folder)
-        if document["method"] != description["method"]:
-            raise SubmissionError(f"{folder} holds a submission of {document['method']!r}")
+        document = _continued(folder, document)
     if options.get("goal_type") == "pose":
         options["env"] = POSE_TOLERANCES
     for task in tasks:
-        if task in document["tasks"]:
-            write_line(f"{task}: done before")
+        queries = benchmark_queries(task, problems, document["split"])[:num_queries]
+        path = folder / f"{task}.h5"
+        if task in document["tasks"] and path.exists():
+            kept = document["tasks"][task].get("num_queries")
+            if kept != len(queries):
+                raise SubmissionError(
+                    f"{path} has {kept} queries, not {len(queries)}: delete it, or use another "
+                    "--output"
+                )
+            write_line(f"{task}: kept from an earlier run; to run it again, delete {path}")
             continue
-        queries = benchmark_queries(task, problems)[:num_queries]
         write_line(f"{task}: {len(queries):,} queries")
         env_task = _env_task(task)
         result, episodes = record(policy, env_task, queries=queries, progress=progress, **options)
         contents = _task_bytes(task, result, queries_digest(queries), episodes)
-        write_atomically(folder / f"{task}.h5", contents)
+        write_atomically(path, contents)
+        failed = [i for i, episode in enumerate(episodes) if not episode.success]
+        if failed:
+            others = " …" if len(failed) > 20 else ""
+            write_line(f"{task}: not reached: {', '.join(map(str, failed[:20]))}{others}")
         seconds = np.mean([episode.seconds for episode in episodes])
         document["tasks"][task] = {
             "num_queries": len(queries),
@@ -219,6 +245,20 @@ def write_submission(
         text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
         write_atomically(folder / "submission.yaml", text.encode())
     return document
+
+
+def _continued(folder: Path, document: dict[str, Any]) -> dict[str, Any]:
+    """The contents of a submission that is continued. Raises SubmissionError: it is another."""
+    before = read_description(folder)
+    for name in DESCRIPTION:
+        if before[name] != document[name]:
+            change = f"{name} is {before[name]!r}, not {document[name]!r}"
+            if name in FIXED:
+                raise SubmissionError(
+                    f"{folder} was begun otherwise, use another --output: {change}"
+                )
+            write_line(f"{folder}/submission.yaml: {change}; it stays, edit it there")
+    return before
 
 
 def _task_bytes(
@@ -357,6 +397,10 @@ def verify_submission(
             or a claimed number is another.
     """
     document = read_description(folder)
+    if document["split"] != "test":
+        raise SubmissionError(
+            f"{folder}: of {document['split']} queries; entries are of test queries"
+        )
     for task, claims in document["tasks"].items():
         path = Path(folder) / f"{task}.h5"
         episodes = read_actions(folder, task)
@@ -368,7 +412,13 @@ def verify_submission(
         queries = available[: len(episodes)]
         if episodes.queries_digest != queries_digest(queries):
             raise SubmissionError(f"{path}: made with other queries or scenes than {task} has here")
-        outcomes = _replay_all(path, episodes, queries, num_workers, progress)
+        try:
+            outcomes = _replay_all(path, episodes, queries, num_workers, progress)
+        except SubmissionError as error:
+            if document["versions"] == versions():
+                raise
+            hint = f"made with {document['versions']}; here is {versions()}"
+            raise SubmissionError(f"{error} ({hint})") from error
         numbers = rates_and_means(outcomes)
         for name in CLAIMS:
             claim = claims.get(name)
@@ -376,7 +426,6 @@ def verify_submission(
                 reason = f"{name} is {numbers[name]}, not {claim} as claimed"
                 raise SubmissionError(f"{folder}: {task}: {reason}")
         intervals = {name: numbers[name] for name in numbers if name.endswith("_interval")}
-        seconds = claims.get("seconds_per_query")
         document["tasks"][task] = {
             "num_queries": len(episodes),
             "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
@@ -384,7 +433,7 @@ def verify_submission(
             "goal_type": episodes.goal_type,
             **{name: numbers[name] for name in CLAIMS},
             **intervals,
-            "seconds_per_query": seconds if type(seconds) in (int, float) else None,
+            "seconds_per_query": float(f"{episodes.seconds.mean():.3g}"),
         }
     return document
 
