@@ -4,8 +4,9 @@
 
 For each task, `mixed_scenes` and `containers`: one test query (where scenes vary, six draws), the
 arm at its start and as a ghost at the goal; and where the scene is fixed, the end-effector paths of
-the first demonstrations, from light (start) to dark (goal). `task_gallery.png` shows all tasks with
-names, and `wide_families.png` a scene of each family of wide scenes, which `--wide` renders alone.
+the first demonstrations, from light (start) to dark (goal). `task_gallery.webp` shows all tasks
+with names, and `wide_families.webp` a scene of each family of wide scenes, which `--wide` renders
+alone.
 """
 
 import sys
@@ -39,7 +40,7 @@ FOLDER = Path(__file__).parent / "figures"
 
 
 def save(pixels, name):
-    Image.fromarray(pixels).quantize(64).save(FOLDER / name, optimize=True)
+    Image.fromarray(pixels).save(FOLDER / name, quality=65, method=6)
 
 
 def draw_path(client, positions, colour):
@@ -84,7 +85,7 @@ def save_wide_families():
         tiles[name] = pixels[::2, ::2]
         env.close()
     held_out = {f"{name} (held out)": tiles.pop(name) for name in HELD_OUT}
-    save_gallery(tiles | held_out, "wide_families.png", 6)
+    save_gallery(tiles | held_out, "wide_families.webp", 6)
 
 
 def is_ground(obstacle):
@@ -106,12 +107,12 @@ def main():
             if task in envs.TASKS:
                 gallery[task] = pixels[0]
             grid = np.reshape(pixels, (ROWS, COLUMNS, height, width, channels)).swapaxes(1, 2)
-            save(grid.reshape(ROWS * height, COLUMNS * width, channels), f"{task}.png")
+            save(grid.reshape(ROWS * height, COLUMNS * width, channels), f"{task}.webp")
             env.close()
             continue
         query = load_queries(task)[QUERY]
         pixels = render_query(env, query, SIZE, camera=CAMERAS.get(task))
-        save(pixels, f"{task}.png")
+        save(pixels, f"{task}.webp")
         gallery[task] = pixels[::2, ::2]
         if demo_path(task).exists():
             demos, everywhere = load_demos(task), []
@@ -120,10 +121,10 @@ def main():
                 draw_path(env.client, positions, COLOURS[i % len(COLOURS)])
                 everywhere.append(positions)
             pixels = render_query(env, query, SIZE, np.concatenate(everywhere))
-            save(pixels, f"{task}_demos.png")
+            save(pixels, f"{task}_demos.webp")
         env.close()
     gallery = dict(sorted(gallery.items(), key=lambda item: item[0].startswith("random")))
-    save_gallery(gallery, "task_gallery.png")
+    save_gallery(gallery, "task_gallery.webp")
     save_wide_families()
 
 
