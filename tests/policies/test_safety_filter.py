@@ -19,7 +19,6 @@ from roboarm_nmp.policies.safety_filter import (
     CBF_GAIN,
     ESCAPE_STEPS,
     MAX_RECOVERY,
-    MOMENTUM,
     MOMENTUM_STEPS,
     PATIENCE,
     TURNING_JOINTS,
@@ -237,39 +236,6 @@ def test_unsuitable_environment_is_rejected():
         with pytest.raises(PolicyError, match=message):
             make_policy(lambda observation: np.zeros(7), env, safety_filter=SafetyFilter())
         env.close()
-
-
-def test_escape_is_a_seeded_random_direction_followed_by_momentum():
-    """A policy stands still: an escape begins after `PATIENCE` steps."""
-    safety_filter, calls = SafetyFilter(), []
-
-    def stay(observation):
-        calls.append(None)
-        return np.zeros(7)
-
-    nothing = link_distances(*[(ACTIVATION_DISTANCE,)] * 10)
-    env = fake_env(0.01, lambda state: nothing)
-
-    def walk(seed):
-        state, moves = np.zeros(10), []
-        state[3], state[5] = -0.3, 0.3  # no links are near each other
-        act = safety_filter.filter_policy(stay, env, np.random.default_rng(seed))
-        for _ in range(PATIENCE + ESCAPE_STEPS + 25):
-            moves.append(act({"observation": state, "link_distances": nothing}))
-            state = np.concatenate([state[:7] + moves[-1], state[7:]])
-        return np.array(moves)
-
-    moves = walk(1)
-    assert not moves[:PATIENCE].any()
-    escape, after = np.split(moves[PATIENCE:], [ESCAPE_STEPS])
-    assert (escape == escape[0]).all()
-    assert np.linalg.norm(escape[0]) == pytest.approx(0.01)
-    # Momentum goes on in that direction, clipped to the longest action.
-    steps = (MOMENTUM * (1 - np.arange(1, 26) / MOMENTUM_STEPS)).clip(0, 1)
-    assert after == pytest.approx(steps[:, None] * escape[0], abs=1e-6) and steps[-1] < 0.8
-    assert escape[0, :ESCAPE_JOINTS].all() and not escape[0, ESCAPE_JOINTS:].any()
-    assert len(calls) == PATIENCE + 25
-    assert (walk(1) == moves).all() and (walk(2) != moves).any()
 
 
 @pytest.mark.parametrize(
