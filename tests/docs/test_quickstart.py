@@ -13,7 +13,8 @@ from trainers import PATHS, TINIER, run_here
 
 from roboarm_nmp import __main__
 
-BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", (ROOT / "docs/quickstart.md").read_text(), re.S | re.M)
+PAGE = (ROOT / "docs/quickstart.md").read_text().replace(" \\\n   ", "")
+BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", PAGE, re.S | re.M)
 COMMANDS = [line for kind, text in BLOCKS if not kind for line in text.splitlines()]
 FEWER = {"evaluate": "--num-queries 3 --workers 1", "show": "--size 80 60"}
 
