@@ -82,14 +82,11 @@ def test_policy_overfits_five_demonstrations_and_follows_them(tmp_path, short_ep
     env.close()
 
 
-def test_losses_are_logged_with_a_mixture_from_two_files(tmp_path, short_episodes):
+def test_longer_run_continues_with_a_mixture_from_two_files(tmp_path, short_episodes):
     path = str(demo_path("no_obstacles"))
     flags = ["--num-modes", "2", "--goal-type", "config", "--demos", path, path]
     flags += ["--total-updates", "1000", "--eval-every", "1000"]
     run = run_script("bc", tmp_path, *flags)
-    events = EventAccumulator(str(run)).Reload()
-    losses = [event.value for event in events.Scalars("losses/negative_log_likelihood")]
-    assert len(losses) == 1 and np.isfinite(losses).all()
     assert json.loads((run / "args.json").read_text())["demos"] == [path, path]
     run_here(PATHS["bc"], "--resume", run, "--total-updates", "2000")
     assert json.loads((run / "result.json").read_text())["steps"] == 2000

@@ -28,24 +28,23 @@ LONG += ("updates_per_step",)
 RUN = "--eval-queries 1 --test-queries 1 --runs-dir runs"
 RL = f"--task wall --num-envs 1 --hidden-size 8 --batch-size 4 --learning-starts 20 {RUN}"
 RL += " --total-timesteps 60 --eval-every 60 --horizon 20"
+BC = f"--task wall --hidden-size 8 --batch-size 4 --num-demos 5 {RUN}"
+BC += " --total-updates 4 --eval-every 4"
+ENCODER = "--observations observations --total-updates 2 --eval-every 2 --batch-size 1"
+ENCODER += " --validation-share 0.5 --runs-dir runs"
 TINY = {
     "clean_rl_scripts.sac_her_mp": RL,
     "clean_rl_scripts.td3_her_mp": RL,
     "clean_rl_scripts.crl_mp": RL,
-    "bc_script.bc": f"--task wall --hidden-size 8 --batch-size 4 --num-demos 5 {RUN}"
-    " --total-updates 4 --eval-every 4",
+    **dict.fromkeys(("bc_script.bc", "bc_script.gciql", "bc_script.diffusion"), BC),
     "bc_script.roadmap_bc": f"--paths roadmaps --task wall --hidden-size 8 --token-width 8"
     f" {RUN} --num-blocks 1 --batch-size 4 --first-scenes 1 --pool-scenes 2 --examples-per-scene 4"
     " --updates-per-scene 2 --total-updates 4 --eval-every 4",
-    "scene_embedding_train.vae": "--observations observations --total-updates 2 --eval-every 2"
-    " --batch-size 1 --image-size 16 --width 2 --validation-share 0.5 --runs-dir runs",
-    "scene_embedding_train.vqvae": "--observations observations --total-updates 2 --eval-every 2"
-    " --batch-size 1 --image-size 16 --width 2 --validation-share 0.5 --runs-dir runs",
-    "scene_embedding_train.pointnet2": "--observations observations --total-updates 2"
-    " --eval-every 2 --batch-size 1 --width 4 --validation-share 0.5 --runs-dir runs"
-    " --num-points 16 --num-centres 8 4 --num-neighbours 4",
-    "scene_embedding_train.field": "--observations observations --total-updates 2 --eval-every 2"
-    " --batch-size 1 --width 4 --validation-share 0.5 --runs-dir runs --num-points 16",
+    "scene_embedding_train.vae": f"{ENCODER} --image-size 16 --width 2",
+    "scene_embedding_train.vqvae": f"{ENCODER} --image-size 16 --width 2",
+    "scene_embedding_train.pointnet2": f"{ENCODER} --width 4 --num-points 16 --num-centres 8 4"
+    " --num-neighbours 4",
+    "scene_embedding_train.field": f"{ENCODER} --width 4 --num-points 16",
     "clean_rl_scripts.evaluate": "--policy go-to-goal --task wall --num-queries 1 --json a.json",
     "demo_generation.collect": "--task wall --num 1 --workers 1 --output demos.h5",
     "demo_generation.make_queries": "--task mine.yaml --num-test 2 --num-validation 1 --workers 1"
