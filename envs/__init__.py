@@ -28,35 +28,38 @@ def make(
     sensor_noise: "SensorNoise | None" = None,
     **kwargs: Any,
 ) -> RoboArmEnv:
-    """The environment of a task, e.g. `make("double_walls", goal_type="ee")`.
+    """Make the environment of a task, e.g. `make("double_walls", goal_type="ee")`.
 
     Args:
-        task: name of a task (`TASKS`), or path of a scene file (docs/customise/scene.md). With
-            another arm `TASK@ROBOT`, where ROBOT is a robot's file (docs/customise/robot.md). Or a
-            `Scene`, such as an `ObservedScene` with a point cloud (docs/customise/point_cloud.md).
+        task: name of a task (`TASKS`), or path of a scene file (docs/customise/scene.md). Write
+            `TASK@ROBOT` for another arm, where ROBOT is a robot's file (docs/customise/robot.md).
+            Also a `Scene`, such as an `ObservedScene` with a point cloud
+            (docs/customise/point_cloud.md).
         encoder: appends the encoded scene to `observation`: `oracle`, `point_cloud`, or the name or
-            path of an encoder's network (`envs.perception.encoders`); None for nothing.
-        num_points: of the encoder `point_cloud`.
-        geometry_source: the origin of link distances (`envs.perception.geometry_source`):
+            path of an encoder's network (`envs.perception.encoders`); None appends nothing.
+        num_points: how many points the encoder `point_cloud` appends.
+        geometry_source: where link distances come from (`envs.perception.geometry_source`):
             `ground_truth`, `point_cloud`, or the name or path of an encoder with a decoder. The
             encoder `point_cloud` then encodes points from that decoder.
         link_distances: add `link_distances` to observations, the signed distance of each link from
             the nearest obstacle and its gradient (`envs.wrappers.LinkDistancesWrapper`). Needs
             `geometry_source`.
         append_link_distances: with `link_distances`: append them to `observation`, too, before z_E.
-        goal_link_distances: with `link_distances`: add those at a goal that is a configuration. Use
-            False with hindsight relabelling (docs/guide/environment.md, "Hindsight relabelling").
-        observe_every: steps from one observation of the scene to the next; None: static scenes are
-            observed once, others in every step (`envs.wrappers.ObservedSceneWrapper`).
-        sensor_noise: an `envs.perception.noise.SensorNoise`; None for none.
+        goal_link_distances: with `link_distances`: if the goal is a configuration, also add the
+            link distances there. Use False with hindsight relabelling (docs/guide/environment.md,
+            "Hindsight relabelling").
+        observe_every: steps from one observation of the scene to the next. With None, static
+            scenes are observed once, and others in every step
+            (`envs.wrappers.ObservedSceneWrapper`).
+        sensor_noise: an `envs.perception.noise.SensorNoise`; None for perfect sensors.
         kwargs: arguments of `RoboArmEnv`.
 
     Returns:
-        A `RoboArmEnv`, or one in wrappers that have all of its attributes.
+        A `RoboArmEnv`, possibly in wrappers, which have all of its attributes.
 
     Raises:
-        ValueError: unknown task, malformed scene or robot's file, an argument out of its range,
-            or a file that is no encoder of this robot.
+        ValueError: the task is unknown, the file of the scene or robot is malformed, an argument is
+            out of range, or the encoder was not made for this robot.
     """
     if not isinstance(task, (str, Path, Scene)):
         raise ValueError(f"task must be a name or a path, got {task!r}")
@@ -73,7 +76,7 @@ def make(
             "link_distances needs a geometry_source: ground_truth, point_cloud or an encoder"
         )
     if geometry_source is not None and not link_distances and encoder != "point_cloud":
-        raise ValueError("geometry_source goes with link_distances, or the encoder point_cloud")
+        raise ValueError("geometry_source needs link_distances or the encoder point_cloud")
     env: Any = RoboArmEnv(task if isinstance(task, Scene) else get_task(task).scene, **kwargs)
     # PyTorch and Numba take long to import, so they are imported only where they are needed.
     observes = encoder is not None or link_distances

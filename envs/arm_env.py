@@ -112,7 +112,7 @@ _CHECKS = {
 
 
 class RoboArmEnv(gym.Env):
-    """An arm of n joints, the Franka Panda (7), that has to reach a goal without contact.
+    """An arm that has to reach a goal without contact: by default the Franka Panda, n = 7 joints.
 
     Observations are a dict (the GoalEnv interface of Gymnasium-Robotics), all float32:
 
@@ -125,7 +125,7 @@ class RoboArmEnv(gym.Env):
 
     Actions are float32 in [-1, 1]^n: `relative`, a displacement of the normalised configuration, or
     `subgoal`, the next normalised configuration itself. Either way the displacement is clipped to
-    the L2 norm `max_step`, so an action is a direction unless it is shorter than that.
+    the L2 norm `max_step`, so every longer action only says the direction.
 
     `info` carries `is_success`, `collision` (the arm was in contact in this step),
     `collision_so_far` (in this episode), `ee_distance` (m) and `config_distance` (normalised; NaN
@@ -133,7 +133,7 @@ class RoboArmEnv(gym.Env):
     also `ee_angle` (rad, to the goal's rotation).
 
     Copies (`copy.deepcopy`, pickle) are independent environments in the same state: the episode
-    goes on the same, bit for bit, and so do later ones. A copy has no window.
+    goes on in the same way, bit for bit, and so do later ones. A copy has no window.
 
     Args:
         scene: a `Scene`, or a distribution of scenes: an object with `base`, the `Scene` without
@@ -145,9 +145,9 @@ class RoboArmEnv(gym.Env):
             always draws one.
         goal_type: `ee`, `config`, `combined` (reached like `ee`) or `pose`.
         ee_tolerance: goal radius in metres (paper: 0.02).
-        angle_tolerance: rad, from the goal's rotation, for `pose`. Of the Panda's hand, 0.21 m
-            long, 0.1 rad turn the fingertips away by as much as `ee_tolerance`. (Motion Policy
-            Networks, Fishman et al., 2022, has 0.26 rad and 0.01 m.)
+        angle_tolerance: rad, from the goal's rotation, for `pose`. Turning the Panda's hand, which
+            is 0.21 m long, by 0.1 rad moves its fingertips by about `ee_tolerance`. (Motion Policy
+            Networks, Fishman et al., 2022, use 0.26 rad and 0.01 m.)
         config_tolerance: goal radius in the normalised configuration space (paper: 0.05).
         action_mode: `relative` or `subgoal`.
         max_step: longest displacement per step, L2 in the normalised space (paper: 0.03).
@@ -156,9 +156,9 @@ class RoboArmEnv(gym.Env):
         reward: `sparse`, -1 per step and 0 on reaching the goal, or `dense`, minus the distance
             to the goal in the goal's own metric (metres for `ee` and `combined`). For `pose` that
             is the distance in metres, plus the angle times `ee_tolerance / angle_tolerance`.
-        contact_cost: taken off the reward of each step with a contact.
-        sink_state: instead of terminating, stay where the episode ended, at reward 0 whatever the
-            action, until the horizon.
+        contact_cost: subtracted from the reward of each step with a contact.
+        sink_state: don't terminate, but stay where the episode would have ended, with reward 0 for
+            every action, until the horizon.
         velocities: add joint velocities to `observation`.
         render_mode: None, `rgb_array`, or `human` (opens PyBullet's window). With None, bodies have
             no visual shapes, which saves 50 MB: call `env.world.draw()` before you render
@@ -167,7 +167,7 @@ class RoboArmEnv(gym.Env):
 
     Raises:
         ValueError: an argument is out of its range; the message gives the range.
-        RuntimeError: of all methods that need the simulator: the environment is closed.
+        RuntimeError: a method that needs the simulator is called after `close`.
     """
 
     metadata = {
@@ -265,7 +265,7 @@ class RoboArmEnv(gym.Env):
 
     @property
     def client(self) -> int | None:
-        """PyBullet's number of the physics engine; None once it is closed."""
+        """PyBullet's client id of the physics engine; None after `close`."""
         return self.world.client
 
     @property
@@ -275,7 +275,7 @@ class RoboArmEnv(gym.Env):
 
     @property
     def body(self) -> int:
-        """PyBullet's number of the arm's body."""
+        """PyBullet's id of the arm's body."""
         return self.world.body
 
     @property
@@ -294,7 +294,7 @@ class RoboArmEnv(gym.Env):
         return self.world.current_scene
 
     def set_scene(self, scene: Scene) -> None:
-        """Put the arm into another `Scene`. This ends the episode. An equal one does nothing.
+        """Put the arm into another `Scene`, which ends the episode. An equal scene changes nothing.
 
         The scene may hold the arm's other joints, such as the gripper's, elsewhere.
 
@@ -308,22 +308,22 @@ class RoboArmEnv(gym.Env):
     def in_collision(
         self, configuration: np.ndarray | Sequence[float], time: float = 0.0, moving: bool = True
     ) -> bool:
-        """As `World.in_collision`. Continue with a reset."""
+        """Like `World.in_collision`. It moves the arm, so continue with a reset."""
         return self.world.in_collision(configuration, time, moving)
 
     def is_feasible(self, configuration: np.ndarray, hold_steps: int = HOLD_STEPS) -> bool:
-        """As `World.is_feasible`. Continue with a reset."""
+        """Like `World.is_feasible`. It moves the arm, so continue with a reset."""
         return self.world.is_feasible(configuration, hold_steps)
 
     def sample_feasible(self, rng: np.random.Generator) -> np.ndarray:
-        """As `World.sample_feasible`. Continue with a reset."""
+        """Like `World.sample_feasible`. It moves the arm, so continue with a reset."""
         return self.world.sample_feasible(rng)
 
     def check_configuration(self, name: str, configuration: ArrayLike) -> np.ndarray:
-        """Joint angles as float32 (n,), rad. The episode goes on.
+        """Check joint angles, and return them as float32 (n,), rad. The episode goes on.
 
-        Raises ValueError, with the name: wrong size, not finite, outside the joint limits or in
-        collision.
+        Raises ValueError, which names them: they have the wrong size, are not finite, are outside
+        the joint limits or in collision.
         """
         configuration = checked_configuration(self.robot, name, configuration)
         self.world.check_free(**{name: configuration})
@@ -332,9 +332,9 @@ class RoboArmEnv(gym.Env):
     def sample_query(
         self, rng: np.random.Generator, start: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A start and a goal that is not reached from the outset: two float32 (n,), rad.
+        """Draw a start and a goal that is not reached there: two float32 (n,), rad.
 
-        `start`: to sample a goal only.
+        With `start`, only the goal is drawn.
         """
         if start is None:
             start = self.sample_end(rng)
@@ -347,9 +347,9 @@ class RoboArmEnv(gym.Env):
                 return start, goal
 
     def sample_end(self, rng: np.random.Generator) -> np.ndarray:
-        """A start or a goal: feasible joint angles, float32 (n,).
+        """Draw a start or a goal: feasible joint angles, float32 (n,).
 
-        A random configuration; in wide scenes mostly a grasp (`envs.collision.query_ends`).
+        It's a random configuration, or in wide scenes mostly a grasp (`envs.collision.query_ends`).
         """
         if not isinstance(self.scene, WideScene) or not self.scene.places:
             return self.sample_feasible(rng)
@@ -364,7 +364,7 @@ class RoboArmEnv(gym.Env):
     # --- Episodes
 
     def sample_scene(self, rng: np.random.Generator) -> None:
-        """Change to a scene drawn from the task's distribution. A fixed scene stays."""
+        """Draw a scene from the task's distribution, and change to it. A fixed scene stays."""
         if self.scene_distribution is not None:
             self.scene_at_rest = self.scene_distribution.sample(rng)
             self.set_scene(self.scene_at_rest)
@@ -377,7 +377,7 @@ class RoboArmEnv(gym.Env):
             rng: a NumPy Generator.
 
         Returns:
-            Whether start and goal are free when they have to be; otherwise the scene stays at rest.
+            Whether start and goal are free when they have to be. If not, the obstacles don't move.
         """
         if not self.is_animated:
             return True
@@ -393,7 +393,7 @@ class RoboArmEnv(gym.Env):
         return True
 
     def sample_moving_query(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """As `sample_query`, with motions of the obstacles where the scene's distribution has some.
+        """Like `sample_query`, with motions of the obstacles if the scene's distribution has some.
 
         Raises RuntimeError: the distribution accepts none of many motions.
         """
@@ -410,12 +410,12 @@ class RoboArmEnv(gym.Env):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode from a random feasible start to a random feasible goal.
 
-        If scenes are drawn, in a new one after `episodes_per_scene` episodes.
+        If scenes are random, a new one is drawn after `episodes_per_scene` episodes.
 
         Args:
             seed: an int seeds the generator of scenes and queries.
-            options: a dict of `start`, `goal` (or `goal_pose`) and possibly `scene` starts an
-                episode as `reset_specific` does, through all wrappers and in vector environments.
+            options: with a dict of `start`, `goal` (or `goal_pose`) and possibly `scene`, the
+                episode starts as with `reset_specific`, also in wrappers and vector environments.
 
         Raises:
             ValueError: an unknown option, one of start and goal without the other, or as for
@@ -441,8 +441,8 @@ class RoboArmEnv(gym.Env):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode on a given query.
 
-        Wrappers around this environment, such as Gymnasium's `TimeLimit`, do not notice the call:
-        with them, use `reset(options={"start": start, "goal": goal, "scene": scene})`.
+        Wrappers around this environment, such as Gymnasium's `TimeLimit`, do not notice this call.
+        If you have some, use `reset(options={"start": start, "goal": goal, "scene": scene})`.
 
         Args:
             start: joint angles (n, rad).
@@ -450,8 +450,8 @@ class RoboArmEnv(gym.Env):
                 The goal type `pose` has the pose of these joint angles as its goal.
             scene: a `Scene` to change to first.
             goal_pose: instead of `goal`, with goal type `pose`: position and quaternion (7, m and
-                xyzw) of the end effector. Whether the arm can reach it is not checked. The
-                quaternion is normalised.
+                xyzw) of the end effector. The quaternion is normalised. There is no check
+                that the arm can reach the pose.
 
         Raises:
             ValueError: wrong size, not finite, outside the joint limits or in collision (moving
@@ -518,11 +518,11 @@ class RoboArmEnv(gym.Env):
         )
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One step: `(observation, reward, terminated, truncated, info)`.
+        """Make one step. Returns `(observation, reward, terminated, truncated, info)`.
 
         Raises:
-            ValueError: the action is not n finite numbers; nothing has moved then.
-            RuntimeError: there was no reset yet, or the environment is closed.
+            ValueError: the action is not n finite numbers. Nothing moves then.
+            RuntimeError: `reset` was never called, or the environment is closed.
         """
         self.world.check_open()
         if self.start_configuration is None:
@@ -597,8 +597,8 @@ class RoboArmEnv(gym.Env):
     ) -> np.ndarray:
         """Reward of arriving at `achieved_goal` (..., d) when the goal is `desired_goal` (..., d).
 
-        Returns an array of the batch shape, a NumPy scalar for single goals. With `contact_cost`
-        the `collision` of `info` is read, as by `compute_terminated`. `step` calls this, too.
+        Returns an array of the batch shape, or a NumPy scalar for single goals. With `contact_cost`
+        it reads `collision` in `info`, as `compute_terminated` does. `step` uses it, too.
         """
         distance, reached = self._compare(achieved_goal, desired_goal)
         reward = -distance if self.reward == "dense" else reached.astype(np.float32) - np.float32(1)
@@ -612,8 +612,8 @@ class RoboArmEnv(gym.Env):
         """Whether an episode ends there: bool, of the batch shape; a NumPy scalar for single goals.
 
         `info` is one info dict (entries may be arrays), or a sequence of them as long as the
-        batch. With `stop_on_collision` its `collision`, False where it is missing, ends the
-        episode, too.
+        batch. With `stop_on_collision`, its `collision` also ends the episode; where it is missing,
+        it counts as False.
         """
         _, ended = self._compare(achieved_goal, desired_goal)
         if self.stop_on_collision:
@@ -625,7 +625,7 @@ class RoboArmEnv(gym.Env):
     ) -> np.ndarray:
         """Whether the horizon truncates the episode there: as `compute_terminated`.
 
-        Of `info`, `elapsed_steps` is read, too, 0 where it is missing.
+        It also reads `elapsed_steps` in `info`; where it is missing, it counts as 0.
         """
         late = _entry(info, "elapsed_steps", int) >= self.horizon
         return late & ~self.compute_terminated(achieved_goal, desired_goal, info)
@@ -633,7 +633,7 @@ class RoboArmEnv(gym.Env):
     # --- Images
 
     def render(self) -> np.ndarray | None:
-        """With `rgb_array`: a uint8 image (height, width, 3) of the arm, scene and goal.
+        """Render arm, scene and goal: with `rgb_array`, a uint8 image (height, width, 3).
 
         Points of an `ObservedScene` are orange.
         """

@@ -87,32 +87,32 @@ def image_array(pixels: Any, width: int, height: int) -> np.ndarray:
 class World:
     """A scene with the arm in it, in a physics engine of its own.
 
-    Obstacles with a motion move in every physics step, along their path and whatever is in the way,
-    and contacts push the arm with their velocity. `place` sets the time.
+    Obstacles with a motion follow their path in every physics step, whatever is in the way, and
+    push the arm where they touch it. `place` sets the time.
 
     Copies (`copy.deepcopy`, pickle) are independent worlds in the same state, with the same future,
-    bit for bit, contacts included: they repeat all commands since the arm was placed. A world
-    stores 0.3 kB per environment step for that. A copy has no window, of which PyBullet allows one
-    per process.
+    bit for bit, contacts included. To make one, all commands since the arm was placed are repeated,
+    and a world stores 0.3 kB per environment step for that. A copy has no window, because PyBullet
+    allows only one per process.
 
     Args:
         scene: a `Scene`; by default an empty one.
         window: open PyBullet's window.
         drawn: give bodies visual shapes. They cost 50 MB of memory, and PyBullet takes up to six
-            times as long to add a cylinder or a sphere. Otherwise obstacles are specks in images,
-            until `draw`.
+            times as long to add a cylinder or a sphere. Without them, obstacles are specks in
+            images until you call `draw`.
 
     Attributes:
-        client: PyBullet's number of the engine; None once it is closed.
+        client: PyBullet's client id of the engine; None after `close`.
         robot: the scene's `Robot`.
         arm: the arm's `envs.robots.body.Body`.
-        body: PyBullet's number of the arm's body.
+        body: PyBullet's id of the arm's body.
         scene: the `Scene`, with its motions; `set_scene` changes it.
         has_window: whether PyBullet's window is open.
 
     Raises:
         TypeError: `scene` is not a `Scene`.
-        RuntimeError: of all methods but `close`: the world is closed.
+        RuntimeError: any method but `close` is called after `close`.
     """
 
     robot: Robot
@@ -268,7 +268,7 @@ class World:
 
     @property
     def time(self) -> float:
-        """Seconds since the arm was placed, of simulated time; or as given to `place`."""
+        """Simulated seconds since the arm was placed, plus the time that `place` was given."""
         return self._substep * TIME_STEP
 
     @property
@@ -279,7 +279,7 @@ class World:
         return self._current_scene
 
     def set_time(self, time: float) -> None:
-        """Put moving obstacles where they are at a time (s), whatever the arm does; for images."""
+        """Put moving obstacles where they are at a time (s), for images. The arm stays."""
         self.check_open()
         self._move_obstacles(round(time / TIME_STEP))
 
@@ -383,9 +383,9 @@ class World:
     def is_feasible(self, configuration: np.ndarray, hold_steps: int = HOLD_STEPS) -> bool:
         """Whether joint angles (n, rad) are inside the limits, collision free and held.
 
-        Held: the position controller keeps the arm there for `hold_steps` environment steps, in
-        which moving obstacles begin to move. Moves the arm: call it between episodes, or continue
-        with a reset.
+        The arm holds them if the position controller keeps it there for `hold_steps` environment
+        steps, in which moving obstacles begin to move. Moves the arm: call it between episodes,
+        or continue with a reset.
         """
         if np.any(configuration < self.robot.lower) or np.any(configuration > self.robot.upper):
             return False
@@ -399,7 +399,7 @@ class World:
         return math.sqrt(drift @ drift) <= HOLD_DRIFT
 
     def sample_feasible(self, rng: np.random.Generator) -> np.ndarray:
-        """A feasible configuration, uniform in the limits: float32 (n,), rad.
+        """Draw a feasible configuration, uniformly inside the limits: float32 (n,), rad.
 
         `rng` is a NumPy Generator.
         """
@@ -417,9 +417,9 @@ class World:
     ) -> None:
         """Raise ValueError, naming the contacts, if one of the configurations is in collision.
 
-        The episode then continues as if it had not been checked; otherwise the arm has moved. E.g.
-        `check_free(start=start)`, joint angles (n, rad). Obstacles with a motion count, where they
-        are at time 0, but for the names in `ignoring_motions`.
+        For example `check_free(start=start)`, joint angles (n, rad). After an error the episode
+        goes on as if nothing had been checked; otherwise the arm has moved. Obstacles with a motion
+        count where they are at time 0, except for the names in `ignoring_motions`.
         """
         self.check_open()
         before = self._snapshot()
@@ -434,7 +434,7 @@ class World:
                 )
 
     def contact_names(self, moving: bool = True) -> str:
-        """The pairs in contact, in words; after `in_collision`, with the same `moving`."""
+        """Name the pairs in contact. Call it after `in_collision`, with the same `moving`."""
         kinds = []
         if self.scene.floor is not None:
             kinds.append("the floor")
@@ -452,7 +452,7 @@ class World:
     def place(self, configuration: np.ndarray | Sequence[float], time: float = 0.0) -> None:
         """Teleport the arm to joint angles (n, rad), at rest, leaving no old contact points.
 
-        `time`: s, from which on obstacles move, as a multiple of `TIME_STEP`.
+        Obstacles move from `time` (s, a multiple of `TIME_STEP`) on.
 
         Bullet keeps the contact points of two bodies while these move little against each other.
         So a configuration could inherit points from an earlier one that brought the same two links

@@ -104,15 +104,15 @@ class Rules(NamedTuple):
 
 
 class CollisionChecker:
-    """Collisions of the arm with a scene and with itself.
+    """Checks the arm for collisions with a scene and with itself.
 
-    States are normalised configurations, shape (..., n), floats in [-1, 1]; an answer has the
-    batch's shape, (...), and is empty for an empty batch. Safe to use from several threads.
+    States are normalised configurations, shape (..., n), floats in [-1, 1]. An answer has the
+    batch's shape, (...). You can use one checker from several threads.
 
     Args:
         scene: a static `Scene`, whose robot has n joints.
-        points: m, (n, 3), in the base's frame: the centres of additional balls, for example an
-            observed point cloud. An `ObservedScene` has its own points and radius instead.
+        points: m, (n, 3), in the base's frame: the centres of additional balls, for example of an
+            observed point cloud. An `ObservedScene` brings its own points and radius.
         point_radius: m, of the balls, in [0, `MAX_MARGIN`).
 
     Raises:
@@ -163,15 +163,15 @@ class CollisionChecker:
         table: Box | None = primitives.TABLE,
         floor: float | None = primitives.FLOOR,
     ) -> "CollisionChecker":
-        """The checker of a point cloud, as `envs.perception.point_clouds.prepare_cloud` returns it.
+        """Make the checker of a point cloud that `envs.perception.point_clouds.prepare_cloud` made.
 
         Args:
             points: m, (n, 3), in the base's frame.
             radius: m, of the ball around each point.
             robot: the `Robot`.
-            table, floor: as of a `Scene`; None where the points are all there is.
+            table, floor: as in a `Scene`; None if there are only the points.
 
-        Raises ValueError: as the class.
+        Raises ValueError: as the class does.
         """
         return cls(Scene(table=table, floor=floor, robot=robot), points, radius)
 
@@ -184,15 +184,15 @@ class CollisionChecker:
     ) -> np.ndarray:
         """Whether the arm keeps a margin from the scene and from itself: bool (...).
 
-        Without a margin, the answer is that of `not RoboArmEnv.in_collision(...)`.
+        Without a margin, the answer is the same as `not RoboArmEnv.in_collision(...)`.
 
         Args:
             states: (..., n), normalised.
             margin: m, in [0, `MAX_MARGIN`): from the scene, and between the links.
             clearance: m, in [0, `MAX_MARGIN`): from the scene, in addition.
-            endpoint_margins: None, or `(states (k, n), distances (k,), growth)`: smaller margins
-                around endpoints that are nearer to geometry than `margin`. At L2 distance d
-                (normalised) from one of the states, the margin is at most `distance + growth * d`.
+            endpoint_margins: None, or `(states (k, n), distances (k,), growth)`. This allows
+                smaller margins around endpoints that are nearer to geometry than `margin`: at L2
+                distance d (normalised) from one of the states, at most `distance + growth * d`.
                 Each configuration, or motion, may have its own: (..., k, n) and (..., k).
         """
         states = self._states("states", states)
@@ -216,16 +216,16 @@ class CollisionChecker:
     ) -> np.ndarray:
         """Whether straight motions are free: bool (...).
 
-        Their ends are checked, and points between them that are at most `resolution` apart. With
-        `continuous`, nothing is touched between these points either: what comes nearer than the
-        margin and 2 um anywhere is not free.
+        It checks their ends, and points between them that are at most `resolution` apart. With
+        `continuous` it also covers everything between these points: a motion that comes nearer
+        than the margin plus 2 um anywhere is not free.
 
         Args:
             starts, ends: (..., n), normalised; one may be broadcast to the other.
             margin, clearance, endpoint_margins: as for `is_free`.
             resolution: L2, normalised, > 0.
-            ends_known: both ends are known to be free, and are not checked.
-            continuous: check the whole motions. `resolution` and `ends_known` then don't matter.
+            ends_known: don't check the ends, because they are known to be free.
+            continuous: check whole motions. `resolution` and `ends_known` don't matter then.
         """
         if continuous:
             return self._are_motions_clear(starts, ends, margin, clearance, endpoint_margins)
@@ -309,10 +309,10 @@ class CollisionChecker:
         max_checks: int = 4_000,
         chords: int = 40,
     ) -> tuple[np.ndarray | None, int]:
-        """A path by RRT-Connect, within about `max_checks` checks, in milliseconds.
+        """Find a path by RRT-Connect within about `max_checks` checks, which takes milliseconds.
 
-        The same arguments and generator give the same path. `planning.planner` plans more
-        thoroughly; this is for planning again in each step.
+        The same arguments and generator give the same path. Use it to plan again in each step;
+        `planning.planner` plans more thoroughly.
 
         Args:
             start: (n,), normalised; it is not checked.
@@ -320,11 +320,11 @@ class CollisionChecker:
             rng: a NumPy Generator.
             margin, clearance, endpoint_margins: as for `is_free`.
             reach: L2, normalised, of the longest edge of a tree.
-            max_checks: configurations, >= 1. Shortcuts may take a few more.
-            chords: shortcuts that are tried.
+            max_checks: configurations to check, >= 1. Shortcuts may take a few more.
+            chords: shortcuts to try.
 
         Returns:
-            The path, float64 (k, n), None if none was found; and the number of checks.
+            The path, float64 (k, n), or None if none was found; and the number of checks.
         """
         start = self._states("start", start)
         goals = np.atleast_2d(self._states("goals", goals))
@@ -387,9 +387,9 @@ class CollisionChecker:
         return (path if len(path) else None), checks
 
     def end_distances(self, states: np.ndarray, within: float) -> np.ndarray:
-        """Distances (m) of states (m, n) from everything, and from the scene: (2, m).
+        """Distances (m) of states (m, n) from everything, and from the scene alone: (2, m).
 
-        Infinite where nothing is `within` (m).
+        They are infinite where nothing is `within` (m).
         """
         links = len(self.robot.collision_links)
         return end_distances(states, float(within), links, self._arm, self._world)

@@ -35,9 +35,9 @@ MAX_FILE = 100_000  # bytes
 
 
 def load_robot(name_or_path: str | Path) -> Robot:
-    """The `Robot` called `panda`, or of a URDF, or of a YAML file. It is made once per process.
+    """Load the `Robot` called `panda`, or from a URDF or YAML file, once per process.
 
-    Raises RobotError: there is none, or the file cannot be used.
+    Raises RobotError: there is no such robot, or the file cannot be used.
     """
     if str(name_or_path) == PANDA.name:
         return PANDA

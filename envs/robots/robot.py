@@ -66,18 +66,18 @@ class Link(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """An arm. Equal robots have the same numbers and the same files.
+    """An arm: its joints, limits, links and end effector. It's a value: you can compare arms.
 
     Attributes:
         name: for messages and files.
         urdf: path of the URDF.
-        joint_names, joint_indices: of the n actuated joints, from base to end effector, in the URDF
-            and in PyBullet.
+        joint_names, joint_indices: the n actuated joints from base to end effector: their names in
+            the URDF, and their indices in PyBullet.
         bullet_joint_names: names of all joints, in PyBullet's order.
         link_names: names of all links, by PyBullet's index; -1 is the base.
         lower, upper: position limits (n,), rad or m.
         velocity, acceleration, jerk: limits (n,), rad/s, rad/s^2, rad/s^3 (or m); None if unknown.
-        effort: limits of the torques (n,), N m (or N).
+        effort: limits of the torques (n,), N m (or forces, N).
         held_indices, held_positions, held_effort: the other movable joints, for example fingers:
             PyBullet's indices, where a controller holds them, and its largest force (N, or N m).
         mimics: PyBullet's (index, joint, multiplier, offset) of joints that follow one of the n.
@@ -197,12 +197,12 @@ class Robot:
         return self.described or self
 
     def same_arm(self, other: "Robot") -> bool:
-        """Whether another `Robot` is this arm, wherever held joints are, whatever is attached."""
+        """Whether `other` is this arm, possibly with other held joints or attached objects."""
         return self.arm == other.arm
 
     @property
     def held(self) -> dict[str, float]:
-        """Where the held joints are, rad or m: dict from names to positions."""
+        """The positions of the held joints, rad or m, by name."""
         names = [self.bullet_joint_names[index] for index in self.held_indices]
         return dict(zip(names, self.held_positions, strict=True))
 
@@ -250,8 +250,8 @@ class Robot:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper position limits, two arrays (n,), rad or m.
 
-        `limits`: "urdf" or "datasheet". Raises ValueError: another one, or an arm without the
-        limits of a datasheet.
+        `limits` is "urdf" or "datasheet". Raises ValueError if it's something else, or if the arm
+        has no limits of a datasheet.
         """
         if limits == "urdf":
             return self.lower, self.upper
@@ -291,12 +291,12 @@ class Robot:
 
     @property
     def link_distances_shape(self) -> tuple[int, int]:
-        """Of link distances: for each link, its signed distance (m) and the gradient of that."""
+        """The shape of link distances: per link, its signed distance (m) and the gradient of it."""
         return len(self.collision_links), 1 + self.num_joints
 
     @functools.cached_property
     def reach(self) -> float:
-        """m: the end effector's largest distance from the base, of 10,000 random configurations."""
+        """The end effector's largest distance (m) from the base in 10,000 random configurations."""
         rng = np.random.default_rng(0)
         configurations = rng.uniform(self.lower, self.upper, (10_000, self.num_joints))
         positions = self.forward_kinematics(configurations) - np.array(self.base_position)

@@ -118,7 +118,7 @@ def load_scene(path: str | Path) -> Scene:
     """The `Scene` in a YAML file (format: see the module). Nothing in the file is executed.
 
     Raises:
-        DocumentError: the file is missing, or is not a scene; also for a misspelt key.
+        DocumentError: the file is missing, is not a scene, or has a misspelt key.
     """
     root = load_document(path, allow_tags=False)
     with mistakes_in(path):
@@ -128,11 +128,11 @@ def load_scene(path: str | Path) -> Scene:
 def save_scene(scene: Scene, path: str | Path) -> None:
     """Write a scene so that `load_scene` returns an equal one, with every float exact.
 
-    Atomic: at every moment `path` is the old file or the whole new one.
+    It writes atomically: `path` always has the whole old file or the whole new one.
 
     Raises:
-        DocumentError: `load_scene` would reject the file, which is then not written; or the scene
-            is an `ObservedScene`, whose points a scene file cannot have.
+        DocumentError: `load_scene` would reject the file, or the scene is an `ObservedScene`, whose
+            points a scene file cannot have. Nothing is written then.
         OSError: the file cannot be written; an old file is left as it was.
     """
     path = Path(path)

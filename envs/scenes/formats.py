@@ -78,7 +78,7 @@ WORLD_FILES = (".yaml", ".yml", ".scene")
 
 
 def load_world(path: str | Path) -> Scene:
-    """The `Scene` in a file: of this project's YAML, MoveIt's `.scene` or YAML, or cuRobo's YAML.
+    """Load the `Scene` in a file: our YAML, MoveIt's `.scene` or YAML, or cuRobo's YAML.
 
     Raises DocumentError: the file cannot be used. The message is `PATH:LINE: reason`.
     """

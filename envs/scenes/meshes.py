@@ -57,9 +57,9 @@ class MeshError(ValueError):
 
 
 def load_mesh(name: str, folder: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """The triangles of a file inside of a folder: float64 (v, 3) vertices and int64 (f, 3).
+    """Load the triangles of a file in a folder: float64 (v, 3) vertices and int64 (f, 3) faces.
 
-    Nothing outside of the folder is read, and no other file, such as one of materials.
+    It reads this file only, no other one such as its materials, and nothing outside of the folder.
 
     Raises MeshError: the file is missing, outside of the folder, too large, or damaged; or trimesh
     is not installed.

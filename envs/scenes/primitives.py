@@ -68,13 +68,12 @@ def _link_names(names: Any, what: str) -> tuple[str, ...]:
 class Box:
     """A box: centre, full edges, and orientation as a quaternion (x, y, z, w).
 
-    `motion`: how it moves away from this pose (`envs.scenes.motions`); None: it does not move.
+    `motion`: how it moves away from this pose (`envs.scenes.motions`); None if it doesn't move.
 
-    `may_touch`: names of the arm's links whose contacts with this obstacle are no collisions, with
-    the objects attached to them; True: `Robot.hand_links`. Other obstacles have it, too.
+    `may_touch`: names of the arm's links that may touch this obstacle, with all objects attached to
+    them, without a collision; True stands for `Robot.hand_links`. All kinds of obstacles have it.
 
-    Raises ValueError: the norm of the quaternion differs from 1 by more than 1 %. It is normalised
-    otherwise.
+    The quaternion is normalised. Raises ValueError if its norm differs from 1 by more than 1 %.
     """
 
     position: Vector
@@ -90,7 +89,7 @@ class Box:
 class Cylinder:
     """A cylinder around its local z axis.
 
-    `position` is its centre, `orientation` and `motion` are as of a `Box`.
+    `position` is its centre; `orientation` and `motion` are the same as for a `Box`.
     """
 
     position: Vector
@@ -105,7 +104,7 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A sphere; `position` is its centre, `motion` as of a `Box`."""
+    """A sphere; `position` is its centre, and `motion` is the same as for a `Box`."""
 
     position: Vector
     radius: float
@@ -197,10 +196,9 @@ def floor_box(height: float) -> Box:
 class Scene:
     """An arm and all geometry around it. `table=None` or `floor=None` leave them out.
 
-    `robot` is the arm. `floor` is the height of the floor's surface. `friction` is the obstacles'
-    coefficient; PyBullet multiplies it by the arm's, 0.5. Scenes are values: they can be compared
-    and hashed. Obstacles may have motions (`envs.scenes.motions`): then `at` is the static scene of
-    each time.
+    `robot` is the arm, and `floor` the height of the floor's surface. `friction` is the obstacles'
+    coefficient, which PyBullet multiplies by the arm's, 0.5. You can compare and hash scenes.
+    If obstacles move (`envs.scenes.motions`), `at` gives the static scene of a moment.
 
     Raises:
         TypeError: an obstacle or the table is of another type.
@@ -234,7 +232,7 @@ class Scene:
         if self.floor is not None and not _is_length(self.floor):
             raise ValueError(f"floor must be a height in m or None, got {self.floor!r}")
         if not (is_number(self.friction) and self.friction >= 0):
-            raise ValueError(f"friction must be a number from 0 on, got {self.friction!r}")
+            raise ValueError(f"friction must be a number, at least 0, got {self.friction!r}")
         if not isinstance(self.robot, Robot):
             raise TypeError(f"robot must be a Robot, got {self.robot!r}")
 
@@ -249,9 +247,9 @@ class Scene:
         return all(obstacle.motion is None for obstacle in self.obstacles)
 
     def at(self, t: float) -> "Scene":
-        """The static `Scene` at a time t, s: the obstacles that are present, where they are then.
+        """The static `Scene` at a time t (s): the obstacles that are present, where they are then.
 
-        A static scene is itself at all times. Raises ValueError: the time is not finite.
+        A static scene stays the same. Raises ValueError if the time is not finite.
         """
         if self.is_static:
             return self
@@ -304,16 +302,16 @@ hardly a hole."""
 
 @dataclass(frozen=True)
 class ObservedScene(Scene):
-    """A scene of which a point cloud is known: an observed one of your own, not the project's.
+    """A scene that you have as a point cloud, for example from a real camera.
 
-    For collision checks, encoders and geometry sources its obstacles are the points, balls of
-    `point_radius`, besides possible `obstacles`. The simulator has no contacts with points, and
-    scene files have no points.
+    Collision checks, encoders and geometry sources take each point as a ball of `point_radius`, an
+    obstacle besides possible `obstacles`. In the simulator the points touch nothing, and scene
+    files can't have them.
 
     Attributes:
-        points: float32 (n, 3), m, in the base's frame; a copy that cannot be changed.
+        points: float32 (n, 3), m, in the base's frame; a read-only copy.
         point_radius: m.
-        digest: of the points: scenes with other points differ.
+        digest: a hash of the points, so that scenes with other points differ.
 
     Raises ValueError: the points are not finite or of another shape, or the radius is negative.
     """
@@ -496,7 +494,7 @@ def vertex_counts(rows: np.ndarray) -> np.ndarray:
     """How many of `hull_vertices` each row of `to_array` has: int64 (n,). Raises ValueError."""
     counts = np.where(rows[:, 0] == HULL, rows[:, 8], 0)
     if not (np.isfinite(counts).all() and (counts >= 0).all() and (counts == counts.round()).all()):
-        raise ValueError("a convex hull has a number of vertices that is no whole number")
+        raise ValueError("the number of vertices of a convex hull must be a whole number")
     return counts.astype(np.int64)
 
 

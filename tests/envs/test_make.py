@@ -77,7 +77,7 @@ def test_encoded_scene_follows_appended_link_distances():
             {"append_link_distances": True, "geometry_source": "ground_truth"},
             "append_link_distances needs link_distances",
         ),
-        ({"geometry_source": "ground_truth"}, "geometry_source goes with link_distances, or the e"),
+        ({"geometry_source": "ground_truth"}, "geometry_source needs link_distances or the e"),
         ({"encoder": "point_cloud", "geometry_source": "vae"}, "vae has no decoder"),
     ],
 )

@@ -67,22 +67,23 @@ def load_cloud(
     frame: np.ndarray | Sequence | None = None,
     intrinsics: Sequence[float] | None = None,
 ) -> np.ndarray:
-    """The points in a file: float32 (n, 3), m, in the frame of the robot's base.
+    """Load the points in a file: float32 (n, 3), m, in the frame of the robot's base.
 
-    Points without a measurement stay, as NaN; pixels without a depth (0 or not finite) do not.
+    Points without a measurement stay, as NaN. Pixels without a depth (0 or not finite) do not.
 
     Args:
-        path: of the file; its ending names the format, see the module.
-        units: of the file's lengths: a name in `UNITS`, or a number, m per unit. By default m, and
-            mm for a PNG.
-        frame: the pose of the file's frame in the base's frame, by default the same: position (m)
-            and quaternion (x, y, z, w), 7 numbers, or a homogeneous matrix (4, 4). Of a depth image
-            it is the pose of the camera: x to the right in the image, y down, z forwards.
-        intrinsics: of a depth image: (fx, fy, cx, cy), pixels. A pixel in column u and row v with
+        path: the file; its ending names the format (see the module).
+        units: the unit of the file's lengths: a name in `UNITS`, or a number, m per unit. By
+            default m, and mm for a PNG.
+        frame: the pose of the file's frame in the base's frame: position (m) and quaternion
+            (x, y, z, w), 7 numbers, or a homogeneous matrix (4, 4). By default both frames are the
+            same. For a depth image, the pose of the camera: x to the right in the image, y down,
+            z forwards.
+        intrinsics: for a depth image: (fx, fy, cx, cy), pixels. A pixel in column u and row v with
             the depth z is the point ((u - cx) z / fx, (v - cy) z / fy, z).
 
     Raises:
-        CloudError: no such file, or not one of these formats.
+        CloudError: the file does not exist, or has none of these formats.
         ValueError: `units`, `frame` or `intrinsics` is out of its range.
     """
     path = Path(path)

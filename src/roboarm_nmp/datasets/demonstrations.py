@@ -194,8 +194,7 @@ def load_demos(task_or_path: str | Path, task: str | Path | None = None) -> Demo
     Args:
         task_or_path: name of a task, path of a scene file, `TASK@ROBOT`, or path of a demonstration
             file.
-        task: the task that a demonstration file must be for. The files of other arms than the Panda
-            need it.
+        task: the task that a demonstration file must be for; needed for other arms than the Panda.
 
     Raises:
         DatasetError: the file is missing, corrupt, not a demonstration file, or made for another
@@ -263,14 +262,14 @@ class _JoinedScenes:
 
 
 def load_demo_files(files: Sequence[Path | str], task: str, number: int | None = None) -> Demos:
-    """The `Demos` of several files of a task as one, file after file.
+    """Load several files of a task as one `Demos`, file after file.
 
-    In `made_by`, `parameters` and `seed` they are those of the first file.
+    Its `made_by`, `parameters` and `seed` are the first file's.
 
     Args:
         files: paths; without any, the task's own demonstrations.
         task: the task that they must be for.
-        number: of demonstrations to take from each file, the first ones; None for all.
+        number: how many demonstrations to take from each file, from the first on; None for all.
 
     Raises:
         DatasetError: as `load_demos`.
@@ -319,8 +318,8 @@ def write_demos(
         scenes_of: the `Scene` of each demonstration; None where all of them are the task's.
 
     Raises:
-        DatasetError: invalid arrays, a query twice, or one of the task's test or validation
-            queries. Nothing is written.
+        DatasetError: an array is invalid, a query occurs twice, or it is one of the task's test or
+            validation queries. Nothing is written then.
         ValueError: unknown task.
         OSError: the file cannot be written; an old file stays as it is.
     """

@@ -79,9 +79,9 @@ def write_lerobot(
     """Write demonstrations as a LeRobot dataset, a folder. Returns its number of frames.
 
     Args:
-        folder: an existing one is replaced once the new one is complete.
+        folder: the folder to write. An existing one is replaced once the new one is complete.
         demos: the `Demos`, in a fixed scene, which a dataset doesn't store.
-        env: an environment of the task with `render_mode="rgb_array"`: then frames have an image.
+        env: with an environment of the task with `render_mode="rgb_array"`, frames have an image.
         overwrite: replace a folder that exists.
 
     Raises:

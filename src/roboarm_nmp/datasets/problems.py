@@ -141,9 +141,9 @@ class Problems:
 
 
 def load_problems(path: str | Path, robot: Robot = PANDA) -> Problems:
-    """Load the problems in a file or folder; the formats are those of the module.
+    """Load the problems in a file or folder, in one of the formats that the module describes.
 
-    Problems are as the file has them: starts and goals may be in collision or beyond the limits.
+    Nothing is corrected: starts and goals may be in collision or beyond the limits.
 
     Args:
         path: file or folder.
@@ -151,8 +151,8 @@ def load_problems(path: str | Path, robot: Robot = PANDA) -> Problems:
 
     Raises:
         DatasetError, utils.documents.DocumentError: the file cannot be used; ValueErrors with
-            the path, and the line where there is one. Unusable problems of a file that can be used
-            are in `rejected`.
+            the path, and the line if there is one. If only some problems cannot be used, they are
+            in `rejected`.
     """
     path = Path(path)
     files = [path]
@@ -179,7 +179,7 @@ def load_problems(path: str | Path, robot: Robot = PANDA) -> Problems:
 
 
 def write_problems(path: str | Path, problems: Iterable[Problem], made_by: str = "") -> None:
-    """Write `problems.h5`, atomically: at every moment `path` is the old file or the new one.
+    """Write `problems.h5`, atomically: `path` always has the whole old file or the whole new one.
 
     Args:
         path: file to write; an existing one is replaced.
@@ -187,7 +187,7 @@ def write_problems(path: str | Path, problems: Iterable[Problem], made_by: str =
         made_by: the command line that makes this file.
 
     Raises:
-        DatasetError: problems that a file must not have; nothing is written then.
+        DatasetError: a file may not have these problems. Nothing is written then.
         OSError: the file cannot be written; an old file is left as it was.
     """
     problems = list(problems)

@@ -120,13 +120,12 @@ def load_queries(
     Args:
         task_or_path: name of a task, path of a scene file, `TASK@ROBOT`, or path of a query file.
         split: `test`, `validation`, or, where a task has it, `original`.
-        task: the task that a query file must be for. The files of other arms than the Panda need
-            it.
+        task: the task that a query file must be for; needed for other arms than the Panda.
 
     Raises:
         DatasetError: the file is missing, corrupt, not a query file, or made for another task, for
             another version of the task's scene, or for another robot.
-        ValueError: unknown split; a malformed scene file.
+        ValueError: the split is unknown, or the scene file malformed.
     """
     if split not in (*SPLITS, ORIGINAL):
         raise ValueError(f"unknown split {split!r}: {suggest(split, (*SPLITS, ORIGINAL))}")
@@ -145,7 +144,7 @@ def write_queries(
     made_by: str,
     parameters: dict[str, Any],
 ) -> None:
-    """Write a query file, atomically: at every moment `path` is the old file or the whole new one.
+    """Write a query file, atomically: `path` always has the whole old file or the whole new one.
 
     The same arguments give the same bytes (same build of h5py; before 3.15 it adds time stamps).
 
@@ -160,7 +159,7 @@ def write_queries(
         parameters: JSON-ready dict of everything else that determined the queries.
 
     Raises:
-        DatasetError: arrays that a query file must not have; nothing is written then.
+        DatasetError: a query file may not have these arrays. Nothing is written then.
         ValueError: unknown task, or other splits.
         OSError: the file cannot be written; an old file is left as it was.
     """

@@ -294,7 +294,7 @@ def write_demonstrations(
 ) -> list[Rejected]:
     """Write a demonstration file of recorded motions, atomically; an existing one is replaced.
 
-    The simulated arm follows every motion. What reaches the goal without contact is written.
+    The simulated arm follows every motion. Motions that reach the goal without contact are written.
 
     Args:
         path: the file.
@@ -308,10 +308,10 @@ def write_demonstrations(
         progress: show a progress bar.
 
     Returns:
-        the recordings that are not in the file: their names (by default, numbers), and why.
+        the recordings that were refused: their names (by default, numbers), and why.
 
     Raises:
-        DatasetError: none of them can be a demonstration: nothing is written.
+        DatasetError: none of them can be a demonstration. Nothing is written then.
         ValueError: unknown task.
         OSError: the file cannot be written; an old file stays as it is.
     """

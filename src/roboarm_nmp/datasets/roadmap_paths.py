@@ -95,8 +95,8 @@ def load_roadmap_paths(
 ) -> RoadmapPaths:
     """Load all roadmap paths of a folder, which must be those of `robot`.
 
-    Of several folders (a sequence), the scenes of one come after those of another, and `task` and
-    `seed` are those of the first.
+    From several folders (a sequence), the scenes come folder after folder, and `task` and `seed`
+    are the first folder's.
 
     Raises:
         DatasetError: there are no shards, or one is missing, damaged, or not of the same collection

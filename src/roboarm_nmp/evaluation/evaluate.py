@@ -78,17 +78,18 @@ class EvaluationOptions:
 
     Attributes:
         goal_type: `ee`, `config`, `combined`, `pose`; None for the policy's own, otherwise `ee`.
-            Goal poses are those of the queries' goals. A policy for configurations may have them,
-            too (`policies.pose_goals`).
+            With `pose`, the goal is the pose of the query's goal; a policy for configurations can
+            have it, too (`policies.pose_goals`).
         queries: queries instead of the task's own: the path of a query file, or an object with
             `start` and `goal`, float32 (m, n), rad, and `scenes`, a sequence of m `Scene`s, like
             `datasets.queries.Queries`. Without `scenes` they are in the task's scene, which
             must then not be random.
         problems: path of a file or folder of problems instead of queries
-            (`datasets.problems`), in their own scenes. Of several goals, the goal is the one
-            nearest to the start that is free; of a pose, a free configuration that has it.
+            (`datasets.problems`), in their own scenes. If a problem
+            has several goals, the free one nearest to the start is used; for a pose, a free
+            configuration that has it.
         split: `test`, `validation` or `original`; which queries of the file.
-        num_queries: only the first so many of them; None for all.
+        num_queries: how many of them, from the first on; None for all.
         stop_on_collision: end an episode at the first contact.
         seed: of random numbers, >= 0; each query has its own generator.
         tries: random configurations that `via-points` tries per query, >= 1.
@@ -99,26 +100,26 @@ class EvaluationOptions:
             policy's own, otherwise `ground_truth`.
         safety_filter: a `policies.safety_filter.SafetyFilter` around the policy; None for the one
             that the policy includes, if any; False for none.
-        replan: whenever the policy is stuck, follow a plan for a while
-            (`policies.replanning.ReplanWhenStuck`), among the geometry source's obstacles.
-        search: a policy that draws paths searches for one where it can verify none
+        replan: whenever the policy is stuck, follow a plan for a while, among the obstacles of the
+            geometry source (`policies.replanning.ReplanWhenStuck`).
+        search: let a policy that draws paths search for one if it can verify none
             (`policies.generative`).
-        unknown: what space counts as that no sensor sees: `free` or `occupied`. None: for a policy
-            that draws paths, occupied, and free only where it finds no path otherwise; for
-            `planner` with the geometry source `point_cloud`, free.
-        observe_every: steps from one observation of the scene to the next; None: static scenes are
-            observed once (`envs.wrappers.ObservedSceneWrapper`).
-        sensor_noise: a `envs.perception.noise.SensorNoise`; None for none.
-        action_delay: steps after which an action takes effect; 0: the simulation waits for the
+        unknown: whether space that no sensor sees counts as `free` or `occupied`. With None, a
+            policy that draws paths takes it as occupied, and as free only if it finds no path
+            otherwise; `planner` with the geometry source `point_cloud` takes it as free.
+        observe_every: steps from one observation of the scene to the next. With None, static scenes
+            are observed once (`envs.wrappers.ObservedSceneWrapper`).
+        sensor_noise: a `envs.perception.noise.SensorNoise`; None for perfect sensors.
+        action_delay: steps after which an action takes effect. With 0 the simulation waits for the
             policy (`evaluation.rollout.rollout`).
         real_time: instead of `action_delay`, as many steps as an action, or a plan, takes to
             compute, at least 1. Results then depend on the machine and its load.
         measure_clearance: also measure each episode's smallest distance from the ground-truth
             obstacles.
-        workers: processes, >= 1. More than one needs the caller's script to be importable
-            (`if __name__ == "__main__":`), as always with `multiprocessing`.
-        env: dict of arguments of `envs.make`, such as `action_mode`, where they are other than the
-            defaults. Those that a policy network was trained with go before.
+        workers: processes, >= 1. With more than one, guard your script with
+            `if __name__ == "__main__":`, as always with `multiprocessing`.
+        env: dict of arguments of `envs.make`, such as `action_mode`, that differ from the defaults.
+            A policy network's own arguments take precedence.
 
     Raises:
         EvaluationError: a number is out of its range.
@@ -177,14 +178,14 @@ def evaluate(
             path of a policy network or of a folder with a `policy.onnx`, the name of a pretrained
             policy, a function from an observation (dict of `RoboArmEnv`) to an action (n,), or a
             `policies.policy.Method`; with several workers, one that can be pickled.
-        task: name of the task, or path of a scene file, or `TASK@ROBOT` with a robot's file; None
-            for the task that the policy was trained on, and for none with `problems`.
+        task: name of the task, path of a scene file, or `TASK@ROBOT` with a robot's file. None
+            stands for the task that the policy was trained on; with `problems` there is no task.
         progress: show a progress bar, with the success rate so far.
         options: the fields of `EvaluationOptions`.
 
     Returns:
-        A dict that fits into JSON. Means over nothing (no successful episode, say) are None, and so
-        is what a policy lacks.
+        A dict that JSON can write. Means over nothing (no successful episode, say) are None, and so
+        are values that the policy doesn't have.
 
         - `success_rate`, `collision_free_success_rate`, `collision_rate`, each with its 95% Wilson
           interval, `..._interval`; `contact_share`: the share of all steps with a contact;
@@ -193,13 +194,13 @@ def evaluate(
           (rad/s^3), `sparc`, `ee_sparc`, and with `measure_clearance` `min_clearance` (m): means
           over successes of `motions.metrics.motion_metrics`;
         - `ms_per_action`: of the policy alone, without the simulator and without planning;
-        - `planning_seconds`, `planning_seconds_solved`: means over all queries, and over those with
-          a motion found; `free_motion_rate`, only of `via-points`;
+        - `planning_seconds`, `planning_seconds_solved`: means over all queries, and over those for
+          which a motion was found; `free_motion_rate`, only of `via-points`;
         - `policy`, `task`, `robot` (its name), `goal_type`, `split`, `queries` (the file, if it is
           not the task's own), `problems` (their file and its SHA-256), `num_queries`, `env`,
           `deviations` (from the standard rules), `safety_filter`, `seed`, `tries`, `time_limit`,
           `action_delay` (steps, or `real_time`), `versions`;
-        - `geometry_source`: where obstacles were taken from, None if from nowhere; `privileged`:
+        - `geometry_source`: where obstacles were taken from, None without one; `privileged`:
           whether policy, filter or observations received the ground-truth obstacles;
         - where sensors observe a static scene once, `unobserved_share`: the mean share of the
           arm's motion that passes through space that no sensor sees;
@@ -374,7 +375,7 @@ def _make_job(
             )
             if not by_kinematics:
                 raise EvaluationError(
-                    f"{policy} was trained with the goal type {trained_with!r}, it cannot be "
+                    f"{policy} was trained with the goal type {trained_with!r}, and cannot be "
                     f"evaluated with {options.goal_type!r}: leave out --goal-type"
                 )
         options = replace(options, env=options.env | trained)
@@ -438,8 +439,8 @@ def _with_one_goal(problem: Problem) -> Problem:
         goal = goal_configuration(robot, problem.goal_pose, problem.start, checker)
         if goal is None:
             raise EvaluationError(
-                f"problem {problem.name}: its goal pose cannot be reached freely; leave it out, or "
-                f"give another goal"
+                f"problem {problem.name}: no collision-free configuration has its goal pose; "
+                f"leave it out, or give another goal"
             )
         return problem._replace(goals=goal[None].astype(np.float64))
     states = robot.normalise(problem.goals)

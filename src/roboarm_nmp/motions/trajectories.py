@@ -180,13 +180,13 @@ def save_joint_path(
     """Write a joint path, atomically.
 
     Args:
-        path: the file, by its ending; an existing one is replaced.
+        path: the file; its ending names the format. An existing one is replaced.
         configurations: (n, j), rad.
         times: (n,), s.
-        robot: the `Robot`, whose joints .json and .yaml name; by default they are `q1`, ...
+        robot: the `Robot` whose joints .json and .yaml name; by default they are `q1`, ...
 
     Raises:
-        ValueError: another ending, or other shapes.
+        ValueError: the ending is unknown, or a shape is wrong.
         OSError: the file cannot be written.
     """
     configurations = np.asarray(configurations)
@@ -224,24 +224,23 @@ def save_trajectory(path: str | Path, trajectory: JointTrajectory | Trajectory) 
 
 
 def load_joint_path(path: str | Path, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """The times (n,), s, and configurations (n, j), rad, in a file, whoever made it.
+    """Load the times (n,), s, and configurations (n, j), rad, of a file from anyone.
 
-    Without times, the configurations are waypoints: the result is `timed`. The `Robot` has j
-    joints.
+    Configurations without times are waypoints, which `timed` gives times. The `Robot` has j joints.
 
-    Raises DatasetError: no such file, or not a joint path of this robot.
+    Raises DatasetError: the file does not exist, or is not a joint path of this robot.
     """
     trajectory = load_trajectory(path, robot)
     return trajectory.times, trajectory.positions
 
 
 def load_trajectory(path: str | Path, robot: Robot) -> JointTrajectory:
-    """Load the trajectory in a file, whoever made it.
+    """Load the trajectory in a file from anyone.
 
-    Velocities and accelerations are None where the file has none. Without times, the configurations
-    are waypoints: times and positions are `timed`.
+    Velocities and accelerations are None if the file has none. Configurations without times are
+    waypoints, which `timed` gives times.
 
-    Raises DatasetError: no such file, or not a trajectory of this robot.
+    Raises DatasetError: the file does not exist, or is not a trajectory of this robot.
     """
     try:
         check_ending(path)

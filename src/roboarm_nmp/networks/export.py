@@ -43,7 +43,7 @@ def save_network(
     output_names: Sequence[str],
     variable_axes: Mapping[str, Sequence[int]] | None = None,
 ) -> None:
-    """Write a network as an ONNX file, atomically. The module itself is not touched.
+    """Write a network as an ONNX file, atomically. The module itself stays as it is.
 
     It is exported in eval mode, on the CPU, for any batch size, and compared with the module on the
     example inputs before anything is written.
@@ -58,8 +58,8 @@ def save_network(
         variable_axes: dict from input name to its axes, besides the first, whose sizes may vary.
 
     Raises:
-        NetworkError: it cannot be exported, uses an operator that is not allowed, or the file
-            would compute something else.
+        NetworkError: the network cannot be exported, uses an operator that is not allowed, or the
+            file would compute something else.
         OSError: the file cannot be written.
     """
     module = copy.deepcopy(getattr(module, "_orig_mod", module)).cpu().eval()  # undo torch.compile

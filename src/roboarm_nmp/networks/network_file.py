@@ -27,7 +27,8 @@ def load_network(path: str | Path, provider: str = "CPUExecutionProvider") -> "N
         provider: of ONNX Runtime; `CUDAExecutionProvider` needs `onnxruntime-gpu`.
 
     Raises:
-        NetworkError: no such file or provider, damaged, or with contents that are not allowed.
+        NetworkError: the file or provider does not exist, or the file is damaged or has contents
+            that are not allowed.
     """
     return Network(read_model(path), path, provider)
 

@@ -107,30 +107,29 @@ class Planner:
     """Plans in the world of an environment.
 
     Args:
-        env: a `RoboArmEnv`; its scene may change between plans. Plans do not touch it.
+        env: a `RoboArmEnv`, whose scene may change between plans. Planning doesn't change it.
         planner: one of `PLANNERS`, or your own: a function `(is_valid, start, goal, rng)` that
             returns a path (k, n) from start to goal, or None. `is_valid` is a `Validity`, start
             and goal are normalised configurations (n,), float64, `rng` is a NumPy Generator. With
             several goals it is called for one after the other, until it returns a path.
-            `compiled` and `RRTConnect` alternate with `OTHER_PLANNER` where they take long.
-        clearance: metres that a path keeps from the scene, in addition to `MARGIN`. A query that
-            starts or ends nearer is planned without it. `MARGIN_SCHEDULE` scales both in a long
-            search. For an arm other than the Panda, both are multiplied by the ratio of their
-            reaches.
+            If they take long, `compiled` and `RRTConnect` alternate with `OTHER_PLANNER`.
+        clearance: how far a path stays from the scene (m), in addition to `MARGIN`. It is left out
+            if the start or the goal is nearer. In a long search `MARGIN_SCHEDULE` reduces both. For
+            other arms than the Panda, both are multiplied by the ratio of the reaches.
         planner_range: longest motion (L2, normalised) that the planner tries at once, if it has
             such a range; 0 for OMPL's own choice, 1.06. (0.4 was chosen with RRTConnect,
             docs/benchmark/performance.md.)
         simplify: rounds of removing vertices and cutting corners; 0 for none.
-        geometry_source: a function from a `Scene` to the `CollisionChecker` to plan with. The
-            default is that of the ground-truth obstacles; `envs.perception.geometry_source` has
+        geometry_source: a function from a `Scene` to the `CollisionChecker` to plan with. By
+            default it checks the ground-truth obstacles; `envs.perception.geometry_source` has
             others.
         max_checks: collision checks for one plan; None for no limit. Unlike a time limit, it ends
             a search at the same point on every machine. Asymptotically optimal planners use all of
             their limit; FMT and BFMT need about 100,000 checks.
-        limits: "urdf" or "datasheet": the position limits inside which the named planners plan.
+        limits: "urdf" or "datasheet": which position limits the named planners obey.
 
     Raises:
-        ValueError: unknown planner or limits, or a number out of range.
+        ValueError: the planner or the limits are unknown, or a number is out of range.
     """
 
     def __init__(
@@ -190,38 +189,37 @@ class Planner:
         goal_pose: ArrayLike | None = None,
         optimise: float = 0,
     ) -> np.ndarray:
-        """A path from start to goal: float32 (k, n), rad; its ends are exactly start and goal.
+        """Plan a path, float32 (k, n), rad, that begins exactly at start and ends exactly at goal.
 
-        The same seed gives the same path on every machine, whatever was planned before, as long as
-        the time suffices: only a search that `time_limit` ends depends on the machine. If following
-        the path takes longer than an episode, there are up to `SEARCHES` searches, and the shortest
-        path is returned.
+        The same seed gives the same path on every machine, whatever was planned before, unless
+        `time_limit` ends the search. If the path takes longer to follow than an episode lasts, up
+        to `SEARCHES` searches are made, and the shortest path is returned.
 
-        The path to a set of goals ends at one of them, whichever is reached first: searches prefer
-        those nearest to the start. For a goal pose, the set are up to `MAX_GOALS` collision-free
+        With a set of goals, the path ends at the one that is reached first; searches prefer goals
+        near the start. For a goal pose, the set consists of up to `MAX_GOALS` collision-free
         configurations from inverse kinematics.
 
         Args:
             start: joint angles (n, rad), inside the `limits`.
             goal: joint angles (n, rad), inside the `limits`, or a set of goals (m, n), of which
                 those in collision, or outside the limits, are ignored.
-            scene: a `Scene` with the same arm; None: that of the environment.
+            scene: a `Scene` with the same arm; None for the environment's.
             seed: int >= 0 or a sequence of such ints, as for `np.random.default_rng`.
             time_limit: seconds for all searches; `math.inf` for no limit. The plan may take a
                 little longer.
             goal_pose: instead of `goal`, a pose of the end effector (7,), as of
                 `Robot.end_effector_pose`.
-            optimise: search on for a shorter path: a float for so many seconds, an int for so many
-                further searches, which give the same path on every machine. `time_limit` and
-                `max_checks` hold for all searches together.
+            optimise: go on searching for a shorter path, for so many seconds if it's a float, or
+                for so many more searches if it's an int, which gives the same path on every
+                machine. `time_limit` and `max_checks` hold for all searches together.
 
         Raises:
-            ValueError: start or goal is not n numbers inside the limits, or is in collision, or so
-                are all goals of a set; both or none of `goal` and `goal_pose` are given; seed or
-                time_limit is out of range; your own planner returned something that is not a path
-                from start to goal.
-            PlanningError: no path within `time_limit` and `max_checks`, or no free configuration
-                has the goal pose.
+            ValueError: the start, the goal or every goal of a set is not n numbers inside the
+                limits, or is in collision; both or none of `goal` and `goal_pose` are given; seed
+                or time_limit is out of range; or your own planner returned something that is not
+                a path from start to goal.
+            PlanningError: there is no path within `time_limit` and `max_checks`, or no free
+                configuration has the goal pose.
         """
         if seed is None:
             raise ValueError("seed must be an int or a sequence of ints, got None")
@@ -286,9 +284,9 @@ class Planner:
         time_limit: float = 5.0,
         num_threads: int | None = None,
     ) -> list[np.ndarray | None]:
-        """The paths of many queries, planned in several threads; None where none was found.
+        """Plan the paths of many queries in several threads; None where no path was found.
 
-        Path i is that of `plan(*queries[i], seed=[*seed, i])`, whatever the number of threads.
+        Path i is the same as `plan(*queries[i], seed=[*seed, i])`, for any number of threads.
 
         Args:
             queries: starts, goals and scenes, as for `plan`.
@@ -296,7 +294,7 @@ class Planner:
             time_limit: seconds for each query.
             num_threads: by default, the number of cores.
 
-        Raises ValueError: as `plan`; the first query that is not possible.
+        Raises ValueError: as `plan` does, for the first query that is not possible.
         """
         seeds = [seed] if isinstance(seed, int) else list(seed)
 

@@ -191,7 +191,7 @@ def test_queries_keep_their_hulls(tmp_path):
     for change, reason in [
         ({"hull_vertices": arrays["hull_vertices"][1:]}, "convex hulls of"),
         ({"hull_vertices": arrays["hull_vertices"] * 0}, "in one plane"),
-        ({"obstacles": arrays["obstacles"] * [*[1] * 8, 1.01, 1, 1]}, "no whole number"),
+        ({"obstacles": arrays["obstacles"] * [*[1] * 8, 1.01, 1, 1]}, "must be a whole number"),
     ]:
         with pytest.raises(DatasetError, match=f"{path}: obstacles: .*{reason}"):
             read_scenes(path, base, arrays | change)
