@@ -68,6 +68,8 @@ ompl ompl_rrt_connect "$both" "OMPL RRT-Connect" --function ompl_planners:rrt_co
   --link https://ompl.kavrakilab.org
 ompl bit_star "$both" "OMPL BIT*, 1 s" --function ompl_planners:bit_star \
   --link https://arxiv.org/abs/1405.5848
+ompl rrt_star "$both" "OMPL RRT*, 1 s" --function ompl_planners:rrt_star \
+  --link https://arxiv.org/abs/1105.1186
 entry roboplan_rrt_star "$both" "roboplan RRT*" --function roboplan_rrt_star:begin --searches \
   --observes ground_truth --authors roboplan --licence MIT --link https://pypi.org/project/roboplan
 example trajectory_optimisation "$both" "optimised path, as by CHOMP" --searches \

@@ -96,12 +96,13 @@ class Args(RunArgs, EnvArgs):
     """environment steps of the whole run"""
     learning_starts: flags.NonNegativeInt = 2_000
     """environment steps with random actions before the first update"""
-    horizon: flags.Horizon = 400
-    """steps after which an episode of the training is truncated"""
+    horizon: flags.Horizon = 100
+    """steps after which an episode of the training is truncated: those of an arm that got stuck
+    teach little"""
     stop_on_collision: bool = False
     """end an episode of the training at the first contact: goals beyond it are never reached"""
-    updates_per_step: flags.NonNegativeFloat = 0.5
-    """updates of the critic per environment step"""
+    updates_per_step: flags.NonNegativeFloat = 0.1
+    """updates of the critic per environment step; with more, it learns its few episodes by heart"""
     batch_size: flags.PositiveInt = 256
     """transitions per update; for each, the goals of all others are negatives"""
     contrastive_loss: Literal["symmetric", "forward", "backward", "binary"] = "symmetric"
@@ -135,7 +136,7 @@ class Args(RunArgs, EnvArgs):
     target_entropy: flags.FiniteFloat | Literal["auto"] | None = "auto"
     """entropy that alpha is tuned to, of the unscaled action; `auto`: minus the number of joints;
     `None`: alpha is constant"""
-    policy_average: flags.PositiveShare = 0.0003
+    policy_average: flags.PositiveShare = 0.003
     """share of the policy that moves per update into the average that is saved (1: no averaging)"""
     hidden_size: flags.Width = 256
     """width of the hidden layers of policy and critic"""
@@ -251,6 +252,7 @@ class Critic(nn.Module):
         angles = state * features.half_range + features.middle
         step = action - state if self.args.action_mode == "subgoal" else action
         step = step * (MAX_STEP / step.norm(dim=1, keepdim=True).clamp_min(MAX_STEP))
+        step = (state + step).clamp(-1.0, 1.0) - state  # joints stop at their limits
         inputs += [torch.sin(angles), torch.cos(angles), step / MAX_STEP]
         if features.jacobian is not None:
             end_effector = observation[:, features.ee][:, :3]

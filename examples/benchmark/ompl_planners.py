@@ -3,9 +3,9 @@
     roboarm benchmark run --function ompl_planners:bit_star --observes ground_truth --searches \
         --output entry
 
-`rrt_connect` (Kuffner and LaValle, 2000) ends with its first path. `bit_star` (Gammell et al.,
-2015) and `aorrtc` (Wilson et al., 2025) improve it for a second of processor time. Then OMPL
-simplifies it. Run the command in this folder.
+`rrt_connect` (Kuffner and LaValle, 2000) ends with its first path. `rrt_star` (Karaman and
+Frazzoli, 2011) and `bit_star` (Gammell et al., 2015) improve it for a second of processor time.
+Then OMPL simplifies it. Run the command in this folder.
 """
 
 import functools
@@ -75,4 +75,4 @@ def plan(planner, problem):
 
 rrt_connect = functools.partial(plan, og.RRTConnect)
 bit_star = functools.partial(plan, og.BITstar)
-aorrtc = functools.partial(plan, og.AORRTC)
+rrt_star = functools.partial(plan, og.RRTstar)
