@@ -65,6 +65,8 @@ class DistanceField:
         self.num_spheres = len(self._spheres)
         self._cell = scale_of(robot) * _CELL
         self._low = np.array(robot.base_position) + scale_of(robot) * _LOW
+        numbers = self._low, self._cell, self._chain, self._spheres
+        self._single = tuple(np.float32(one) for one in numbers)
 
     def of_scene(self, points: np.ndarray, scene: Scene) -> np.ndarray:
         """The field of points (n, 3), m, and a scene's table and floor: uint8, `shape`."""
@@ -108,11 +110,8 @@ class DistanceField:
             states,
             np.require(rows, np.int64, ("C", "W")),
             fields,
-            self._low,
-            self._cell,
-            self._chain,
-            self._spheres,
-            hinge,
+            *self._single,
+            np.float32(hinge),
             distances,
             uphill,
         )

@@ -45,7 +45,7 @@ from roboarm_nmp.envs.collision.lanes_kernels import (
     spread,
     store,
 )
-from roboarm_nmp.envs.collision.motion_kernels import free_batch, is_apart_from_points, margin_of
+from roboarm_nmp.envs.collision.motion_kernels import is_apart_from_points, margin_of
 from roboarm_nmp.utils.numba_cache import compiled, uncounted
 
 # What is undecided in a block: a body and a shape; or one of these and a pair's index, or a body.
@@ -370,18 +370,20 @@ def motion_batch(
     starts, stops, rule, endpoint_margins, arm, arm32, world, grid, ends_known, checks
 ):
     """Write `CollisionChecker.motion_checks` of motions (m, n), (m, n) to `checks` (m,)."""
-    begins = np.ones(starts.shape[0], np.bool_)
-    if not ends_known:
-        free_batch(starts, rule, endpoint_margins, arm, world, begins)
     memory = block_memory(arm, arm32, world)
     axes = memory[0][4]
     for i in range(starts.shape[0]):
-        if not begins[i]:
-            checks[i] = -1
-            continue
         # An answer must not depend on the motions before.
         axes[:] = 0.0
         margins = endpoint_margins[i if endpoint_margins.shape[0] > 1 else 0]
+        if not ends_known and (
+            check_motion(
+                starts[i], starts[i], False, rule, margins, arm, arm32, world, grid, memory
+            )
+            < 0
+        ):
+            checks[i] = -1
+            continue
         checks[i] = check_motion(
             starts[i], stops[i], ends_known, rule, margins, arm, arm32, world, grid, memory
         )

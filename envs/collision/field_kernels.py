@@ -13,7 +13,16 @@ from roboarm_nmp.envs.collision.arm_kernels import (
     SPAN,
     place_arm,
 )
-from roboarm_nmp.envs.collision.lanes_kernels import WIDTH, load, smaller, spread, store
+from roboarm_nmp.envs.collision.block_kernels import F32, place_block, points_of
+from roboarm_nmp.envs.collision.lanes_kernels import (
+    WIDTH,
+    larger,
+    less,
+    load,
+    smaller,
+    spread,
+    store,
+)
 from roboarm_nmp.utils.numba_cache import compiled, uncounted
 
 LOWEST, HIGHEST = -0.05, 0.2  # m: distances in a field are clipped to these
@@ -94,69 +103,116 @@ def _lower(field, begin, across, along):
 
 @compiled
 def sphere_distances(states, rows, fields, low, cell, chain, spheres, hinge, distances, uphill):
-    """Distances of the arm's spheres, and the way out.
+    """Distances of the arm's spheres, and the way out, of 16 states at a time.
 
     Args:
         states: float32 (m, n), normalised.
         rows: int64 (m,): the field of each state.
         fields: uint8 (f, x, y, z), of `fill_field`.
-        low, cell: m, as of `fill_field`.
-        chain: of `hulls.arm_hulls`.
-        spheres: float64 (s, 5): frame, centre there, radius.
-        hinge: m.
+        low, cell: float32, m, as of `fill_field`.
+        chain: of `hulls.arm_hulls`, float32.
+        spheres: float32 (s, 5): frame, centre there, radius.
+        hinge: float32, m.
         distances: float32 (m, s), m; is written.
         uphill: float32 (m, n), m per unit of normalised configuration; is written. The gradient of
             the sum of all distances that are below `hinge`.
     """
-    sizes = fields.shape[1:]
-    frames = np.zeros((chain.shape[0], 12))
-    centres = np.empty((spheres.shape[0], 3))
-    state = np.empty(states.shape[1])
-    base = np.empty(3, np.int64)
-    share = np.empty(3)
-    gradient = np.empty(3)
-    corner = np.empty(8)
-    edge = np.empty(4)
-    for m in range(states.shape[0]):
-        for j in range(states.shape[1]):
-            state[j] = min(max(states[m, j], -1.0), 1.0)
-            uphill[m, j] = 0.0
-        place_arm(state, chain, spheres, frames, centres)
+    n = states.shape[1]
+    block, slopes = np.empty((n + 1) * WIDTH, np.float32), np.empty(n * WIDTH, np.float32)
+    frames = np.empty(chain.shape[0] * 12 * WIDTH, np.float32)
+    memory = np.empty(13 * WIDTH, np.float32)
+    for first in range(0, states.shape[0], WIDTH):
+        last = min(first + WIDTH, states.shape[0])
+        for i in range(WIDTH):
+            for j in range(n):
+                number = states[min(first + i, last - 1), j]
+                block[j * WIDTH + i] = min(max(number, F32(-1.0)), F32(1.0))
+        slopes[:] = 0.0
+        place_block(block, chain, frames)
         for s in range(spheres.shape[0]):
-            for axis in range(3):
-                place = (centres[s, axis] - low[axis]) / cell
-                place = min(max(place, 0.0), sizes[axis] - 1.001)
-                base[axis] = int(place)
-                share[axis] = place - base[axis]
-            a, b, c = base[0], base[1], base[2]
-            for i in range(8):
-                corner[i] = fields[rows[m], a + (i >> 2), b + ((i >> 1) & 1), c + (i & 1)]
-            x, y, z = share[0], share[1], share[2]
-            for i in range(4):  # along z, then y, then x
-                edge[i] = corner[2 * i] + (corner[2 * i + 1] - corner[2 * i]) * z
-            left = edge[0] + (edge[1] - edge[0]) * y
-            right = edge[2] + (edge[3] - edge[2]) * y
-            distance = LOWEST + STEP * (left + (right - left) * x) - spheres[s, RADIUS]
-            distances[m, s] = distance
-            if distance >= hinge:
-                continue
-            scale = STEP / cell
-            gradient[0] = (right - left) * scale
-            gradient[1] = ((edge[1] - edge[0]) * (1.0 - x) + (edge[3] - edge[2]) * x) * scale
-            left = (corner[1] - corner[0]) * (1.0 - y) + (corner[3] - corner[2]) * y
-            right = (corner[5] - corner[4]) * (1.0 - y) + (corner[7] - corner[6]) * y
-            gradient[2] = (left * (1.0 - x) + right * x) * scale
-            f = int(spheres[s, FRAME])
-            while f > 0:
-                ax, ay, az = frames[f, 2], frames[f, 5], frames[f, 8]
-                if chain[f, PRISMATIC] == 0.0:
-                    px = centres[s, 0] - frames[f, 9]
-                    py = centres[s, 1] - frames[f, 10]
-                    pz = centres[s, 2] - frames[f, 11]
-                    ax, ay, az = ay * pz - az * py, az * px - ax * pz, ax * py - ay * px
-                slope = gradient[0] * ax + gradient[1] * ay + gradient[2] * az
-                uphill[m, int(chain[f, JOINT])] += slope * 0.5 * chain[f, SPAN]
-                f = int(chain[f, PARENT])
+            _distances_of_sphere(
+                spheres, s, frames, chain, rows, first, last, fields, low, cell, hinge,
+                memory, distances, slopes,
+            )  # fmt: skip
+        for i in range(first, last):
+            for j in range(n):
+                uphill[i, j] = slopes[j * WIDTH + i - first]
+
+
+@uncounted
+def _distances_of_sphere(
+    spheres, s, frames, chain, rows, first, last, fields, low, cell, hinge, memory, distances, slopes
+):  # fmt: skip
+    """Write the distances of one sphere in a block of states, and add to the block's `slopes`."""
+    f = int(spheres[s, FRAME])
+    x, y, z = points_of(frames, f, spheres[s, 1], spheres[s, 2], spheres[s, 3])
+    per_cell = F32(1.0) / cell
+    store(memory, 0, _within((x - low[0]) * per_cell, fields.shape[1]))
+    store(memory, WIDTH, _within((y - low[1]) * per_cell, fields.shape[2]))
+    store(memory, 2 * WIDTH, _within((z - low[2]) * per_cell, fields.shape[3]))
+    for i in range(WIDTH):
+        row = rows[min(first + i, last - 1)]
+        a, b, c = int(memory[i]), int(memory[WIDTH + i]), int(memory[2 * WIDTH + i])
+        memory[i] -= a
+        memory[WIDTH + i] -= b
+        memory[2 * WIDTH + i] -= c
+        for corner in range(8):
+            number = fields[row, a + (corner >> 2), b + ((corner >> 1) & 1), c + (corner & 1)]
+            memory[(3 + corner) * WIDTH + i] = number
+    u, v, w = load(memory, 0), load(memory, WIDTH), load(memory, 2 * WIDTH)
+    # Along z, then y, then x.
+    low_low, low_high = _between(memory, 3, 4, w), _between(memory, 5, 6, w)
+    high_low, high_high = _between(memory, 7, 8, w), _between(memory, 9, 10, w)
+    left = low_low + (low_high - low_low) * v
+    right = high_low + (high_high - high_low) * v
+    distance = (left + (right - left) * u) * F32(STEP) + (F32(LOWEST) - spheres[s, RADIUS])
+    store(memory, 11 * WIDTH, distance)
+    for i in range(first, last):
+        distances[i, s] = memory[11 * WIDTH + i - first]
+    if less(distance, spread(hinge)) == 0:
+        return
+    for i in range(WIDTH):
+        near = memory[11 * WIDTH + i] < hinge
+        memory[12 * WIDTH + i] = F32(STEP) * per_cell if near else F32(0.0)
+    scale = load(memory, 12 * WIDTH)
+    slope_x = (right - left) * scale
+    near_y, far_y = low_high - low_low, high_high - high_low
+    slope_y = (near_y + (far_y - near_y) * u) * scale
+    near_z = _mixed(memory, 3, 4, 5, 6, v)
+    far_z = _mixed(memory, 7, 8, 9, 10, v)
+    slope_z = (near_z + (far_z - near_z) * u) * scale
+    while f > 0:
+        row = 12 * WIDTH * f
+        ax, ay = load(frames, row + 2 * WIDTH), load(frames, row + 5 * WIDTH)
+        az = load(frames, row + 8 * WIDTH)
+        if chain[f, PRISMATIC] == F32(0.0):
+            px = x - load(frames, row + 9 * WIDTH)
+            py = y - load(frames, row + 10 * WIDTH)
+            pz = z - load(frames, row + 11 * WIDTH)
+            ax, ay, az = ay * pz - az * py, az * px - ax * pz, ax * py - ay * px
+        slope = slope_x * ax + slope_y * ay + slope_z * az
+        j = int(chain[f, JOINT]) * WIDTH
+        store(slopes, j, load(slopes, j) + slope * (F32(0.5) * chain[f, SPAN]))
+        f = int(chain[f, PARENT])
+
+
+@uncounted
+def _within(place, size):
+    return smaller(larger(place, spread(F32(0.0))), spread(F32(size - 1.001)))
+
+
+@uncounted
+def _between(memory, one, other, share):
+    number = load(memory, one * WIDTH)
+    return number + (load(memory, other * WIDTH) - number) * share
+
+
+@uncounted
+def _mixed(memory, one, other, third, fourth, share):
+    """The slope along z of a face's lower edge and of its upper one, mixed."""
+    lower = load(memory, other * WIDTH) - load(memory, one * WIDTH)
+    upper = load(memory, fourth * WIDTH) - load(memory, third * WIDTH)
+    return lower + (upper - lower) * share
 
 
 @compiled

@@ -90,8 +90,11 @@ def remember_points(scene: Scene) -> None:
 
 
 def fine_observed_points(scene: Scene, num_rays: int | None = None) -> np.ndarray:
-    """As `observed_points`, one per cube of `FINE_CELL`. `num_rays`: as of `sensor_images`."""
-    return _thin(scene, FINE_CELL, num_rays)
+    """As `observed_points`, one per cube of `FINE_CELL`; with `num_rays`, one per ray that hits.
+
+    `num_rays`: as of `sensor_images`.
+    """
+    return _thin(scene, FINE_CELL if num_rays is None else None, num_rays)
 
 
 @functools.lru_cache(CACHED_SCENES)
@@ -99,12 +102,12 @@ def _observe(scene: Scene) -> np.ndarray:
     return _thin(scene, CELL)
 
 
-def _thin(scene: Scene, cell: float, num_rays: int | None = None) -> np.ndarray:
+def _thin(scene: Scene, cell: float | None, num_rays: int | None = None) -> np.ndarray:
     points = _clouds(scene, num_rays)
     scale = scale_of(scene.robot)
     if isinstance(scene, SceneObservation) and scene.noise.changes_images:
         points = without_outliers(points, scale * CELL, MIN_POINTS)
-    return one_per_cell(points, scale * cell)
+    return points if cell is None else one_per_cell(points, scale * cell)
 
 
 @functools.lru_cache(1)  # the coarse and the fine points of a scene are needed together

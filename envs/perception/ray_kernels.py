@@ -344,6 +344,7 @@ def mark_seen(points, view, depth, behind, seen):
         behind: m: a point so far behind what a pixel shows is seen.
     """
     height, width = depth.shape
+    across, upwards = 0.5 * width / view[ACROSS], 0.5 * height / view[UPWARDS]
     for i in range(points.shape[0]):
         if seen[i]:
             continue
@@ -355,9 +356,34 @@ def mark_seen(points, view, depth, behind, seen):
         ahead = x * view[AXES + 6] + y * view[AXES + 7] + z * view[AXES + 8]
         if ahead <= view[NEAREST]:
             continue
-        right = (x * view[AXES] + y * view[AXES + 1] + z * view[AXES + 2]) / view[ACROSS]
-        up = (x * view[AXES + 3] + y * view[AXES + 4] + z * view[AXES + 5]) / view[UPWARDS]
-        column = int(math.floor((1.0 + right / ahead) / 2.0 * width))
-        row = int(math.floor((1.0 - up / ahead) / 2.0 * height))
+        right = x * view[AXES] + y * view[AXES + 1] + z * view[AXES + 2]
+        up = x * view[AXES + 3] + y * view[AXES + 4] + z * view[AXES + 5]
+        share = 1.0 / ahead
+        column = int(math.floor(0.5 * width + right * across * share))
+        row = int(math.floor(0.5 * height - up * upwards * share))
         if 0 <= column < width and 0 <= row < height:
             seen[i] = ahead <= depth[row, column] + behind
+
+
+@compiled
+def next_to_seen(seen, places, numbers):
+    """Which places are not seen, but one of the six around them is: bool (n,).
+
+    Args:
+        seen: bool (n,).
+        places: int64 (n, 3), of each place in `numbers`.
+        numbers: int32 (a, b, c), the number of the place at each cell of a grid; -1 for none.
+    """
+    chosen = np.zeros(seen.shape[0], np.bool_)
+    for i in range(seen.shape[0]):
+        if seen[i]:
+            continue
+        a, b, c = places[i, 0], places[i, 1], places[i, 2]
+        for step in (-1, 1):
+            for other in (
+                numbers[a + step, b, c],
+                numbers[a, b + step, c],
+                numbers[a, b, c + step],
+            ):
+                chosen[i] |= other >= 0 and seen[other]
+    return chosen

@@ -11,7 +11,7 @@ import numpy as np
 
 from roboarm_nmp.envs.collision.distance_field import DistanceField
 from roboarm_nmp.envs.perception.point_clouds import are_near_arm, sensor_images
-from roboarm_nmp.envs.perception.ray_kernels import mark_seen
+from roboarm_nmp.envs.perception.ray_kernels import mark_seen, next_to_seen
 from roboarm_nmp.envs.perception.sensors import SceneObservation, view_of
 from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.robots.robot import Robot
@@ -64,29 +64,25 @@ def unseen_points(scene: Scene, states: np.ndarray) -> np.ndarray:
     """
     if isinstance(scene, ObservedScene):
         return np.empty((0, 3), np.float32)
-    places, in_reach = _places(scene.robot.arm)
-    seen = np.zeros(in_reach.shape, np.bool_)
-    seen[in_reach] = are_seen(scene, places)
-    around = np.pad(seen, 1)
-    near = np.zeros(seen.shape, np.bool_)
-    for axis in range(3):
-        for begin in (0, 2):
-            part = [slice(1, -1)] * 3
-            part[axis] = slice(begin, begin + seen.shape[axis])
-            near |= around[tuple(part)]
-    points = places[(~seen & near)[in_reach]].astype(np.float32)
+    places, cells, numbers = _places(scene.robot.arm)
+    chosen = next_to_seen(are_seen(scene, places), cells, numbers)
+    points = places[chosen].astype(np.float32)
     return points[~are_near_arm(points, scene.robot, states, ARM_DISTANCE)]
 
 
 @functools.lru_cache(8)
-def _places(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Centres of cubes in a robot's reach, m, (k, 3), and which ones of a grid they are, bool."""
+def _places(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres of cubes in a robot's reach, m, (k, 3); `places`, `numbers` of `next_to_seen`."""
     scale = scale_of(robot)
-    half = int(_REACH / UNSEEN_CELL) + 1
+    half = int(_REACH / UNSEEN_CELL) + 1  # (a cube farther, so that each place has six around it)
     along = np.arange(-half, half + 1) * UNSEEN_CELL
     places = np.stack(np.meshgrid(along, along, along, indexing="ij"), -1)
     in_reach = np.linalg.norm(places, axis=-1) <= _REACH
-    return scale * (places[in_reach] + _SHOULDER) + np.array(robot.base_position), in_reach
+    cells = np.argwhere(in_reach)
+    numbers = np.full(in_reach.shape, -1, np.int32)
+    numbers[in_reach] = np.arange(len(cells))
+    places = scale * (places[in_reach] + _SHOULDER) + np.array(robot.base_position)
+    return places, cells, numbers
 
 
 def unobserved_share(scene: Scene, states: np.ndarray) -> float:

@@ -6,6 +6,7 @@
 What policies and encoders receive and return, and their metadata: docs/reference/file_formats.md.
 """
 
+import copy
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -37,8 +38,8 @@ class Network:
     """A loaded network: call it with all its inputs, by name.
 
     NumPy arrays (N, ...) give an array, or a list of them if the network has several outputs;
-    PyTorch's tensors give tensors on the same device, without gradients. Raises NetworkError for
-    inputs that do not fit.
+    PyTorch's tensors give tensors on the same device, without gradients. Where the network adds one
+    input to others, it may be a batch of one. Raises NetworkError for inputs that do not fit.
 
     Attributes:
         metadata: dict, as given to `save_network`.
@@ -58,7 +59,12 @@ class Network:
         options.log_severity_level = 4
         if provider not in onnxruntime.get_available_providers():
             raise NetworkError(f"{path}: ONNX Runtime has no {provider} here")
+        model = copy.deepcopy(model)
         try:
+            for one in model.graph.input:  # ONNX Runtime takes equal names for equal sizes
+                size = one.type.tensor_type.shape.dim[0]
+                if size.dim_param:
+                    size.dim_param = f"N of {one.name}"
             self._session = onnxruntime.InferenceSession(
                 model.SerializeToString(), options, providers=[provider]
             )

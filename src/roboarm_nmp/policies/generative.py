@@ -36,7 +36,7 @@ from roboarm_nmp.policies.pose_goals import observed_at_start
 # The numbers below were chosen on validation queries: docs/algorithms/flow.md.
 ROUNDS = 8
 DRAWS, DRAWS_LATER = 32, 64  # paths in the first round, and in later ones
-FIRST = 8  # of a round, those that lack the least distance are repaired and checked first
+AT_ONCE = 8  # repaired and checked; those of a round that lack the least distance come first
 STEPS, STEPS_LATER, STEPS_AGAIN = 4, 8, 4  # of the flow; from half-way on
 MARGINS = (0.01, 0.003, 0.0)  # m
 MARGIN_GROWTH = 0.05  # m per unit of normalised distance, near a start or goal with less room
@@ -133,11 +133,12 @@ class PathsOfNetwork:
         self._query |= {"line_distances": distances, "line_uphill": uphill}
         return self
 
-    def knots(self, x):
-        """The paths (m, k, n) of coefficients (m, c, n)."""
-        bends = np.einsum("ck,mcn->mkn", self.curves, x)
-        path = self.start * (1.0 - self._share) + self.goal * self._share + bends
-        return np.clip(path, -1.0, 1.0)
+    def knots(self, x, which=slice(None)):
+        """The paths (m, k, n) of coefficients (m, c, n), or some of their configurations."""
+        share = self._share[which]
+        path = np.matmul(self.curves[:, which].T, x)
+        path += self.start * (1.0 - share) + self.goal * share
+        return np.clip(path, -1.0, 1.0, out=path)
 
     def draw(self, number, steps, rng):
         """Coefficients of new paths, in so many steps of the flow: (m, c, n)."""
@@ -151,13 +152,10 @@ class PathsOfNetwork:
 
     def _flow(self, x, begin, steps):
         number = len(x)
-        query = {
-            name: np.repeat(np.asarray(one, np.float32)[None], number, axis=0)
-            for name, one in self._query.items()
-        }
+        query = {name: np.asarray(one, np.float32)[None] for name, one in self._query.items()}
         times = np.linspace(begin, 1.0, steps + 1)
         for now, then in zip(times[:-1], times[1:], strict=True):
-            distances, uphill = self._along(self.knots(x)[:, self._every : -1 : self._every])
+            distances, uphill = self._along(self.knots(x, slice(self._every, -1, self._every)))
             path = self._network(
                 noisy=x.reshape(number, -1),
                 time=np.full((number, 1), now, np.float32),
@@ -180,19 +178,20 @@ class PathsOfNetwork:
     def repaired(self, x):
         """Coefficients after gradient steps of the paths away from points."""
         x = x.copy()
+        seen = slice(1, -1, 2)
         smooth = 1.0 / np.arange(1, len(self.curves) + 1, dtype=np.float32)[:, None]
         scale = (self.curves**2).sum(1)[:, None]
+        rates = 2.0 * REPAIR_RATE * smooth / scale * self.curves[:, seen]
         for _ in range(REPAIRS):
-            _, uphill = self._along(self.knots(x)[:, 1:-1:2], REPAIR_DISTANCE)
-            step = np.einsum("ck,mkn->mcn", self.curves[:, 1:-1:2], uphill)
-            step *= 2.0 * REPAIR_RATE * smooth / scale
-            moves = np.abs(np.einsum("ck,mcn->mkn", self.curves[:, ::2], step)).max((1, 2))
+            _, uphill = self._along(self.knots(x, seen), REPAIR_DISTANCE)
+            step = np.matmul(rates, uphill)
+            moves = np.abs(np.matmul(self.curves[:, ::2].T, step)).max((1, 2))
             x += step * np.minimum(1.0, MOST_REPAIR / np.maximum(moves, 1e-6))[:, None, None]
         return x
 
     def lacking(self, x):
         """What the paths of coefficients (m, c, n) lack in distance, summed: (m,)."""
-        distances, _ = self._along(self.knots(x)[:, 1:-1])
+        distances, _ = self._along(self.knots(x, slice(1, -1)))
         return np.maximum(REPAIR_DISTANCE / 2.0 - distances, 0.0).sum((1, 2))
 
     def clearances(self, knots):
@@ -273,7 +272,7 @@ def draw_path(
             fresh, steps = DRAWS_LATER, STEPS_LATER
         new = np.concatenate([*new, paths.draw(fresh, steps, rng)])
         new = new[np.argsort(paths.lacking(new), kind="stable")]
-        for some in (new[:FIRST], new[FIRST:]):
+        for some in np.array_split(new, len(new) // AT_ONCE):
             some = paths.repaired(some)
             drawn = np.concatenate([drawn, some])
             found = _shortest_free(paths, checker, paths.knots(some), MARGINS[0], near[0], rng)
@@ -329,6 +328,8 @@ def _shortest_free(paths, checker, knots, margin, near, rng):
     knots = knots[np.argsort(_lengths(knots), kind="stable")]
     clearances = paths.clearances(knots)
     for path, clearance in zip(knots, clearances, strict=True):
+        if clearance[1:-1].min() < -INACCURACY:
+            continue
         # The motions with the least distance first, a few at a time.
         order = np.argsort(np.minimum(clearance[:-1], clearance[1:]), kind="stable")
         for some in np.array_split(order, (2, 8)):
