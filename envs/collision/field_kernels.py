@@ -141,7 +141,8 @@ def sphere_distances(states, rows, fields, low, cell, chain, spheres, hinge, dis
 
 @uncounted
 def _distances_of_sphere(
-    spheres, s, frames, chain, rows, first, last, fields, low, cell, hinge, memory, distances, slopes
+    spheres, s, frames, chain, rows, first, last, fields, low, cell, hinge, memory, distances,
+    slopes,
 ):  # fmt: skip
     """Write the distances of one sphere in a block of states, and add to the block's `slopes`."""
     f = int(spheres[s, FRAME])
