@@ -81,6 +81,14 @@ def is_apart_from_points(bodies, vertices, cells, k, world, frames, centres, pos
     """Whether a body's hull is at least `gap` (m) from all points of the cloud."""
     _, points, groups, ball = world
     for g in range(groups.shape[0]):
+        x, y, z = (
+            groups[g, 0] - centres[k, 0],
+            groups[g, 1] - centres[k, 1],
+            groups[g, 2] - centres[k, 2],
+        )
+        reach = bodies[k, RADIUS] + groups[g, 3] + gap
+        if x * x + y * y + z * z >= reach * reach:
+            continue
         if box_gap(bodies, k, frames, centres, groups, g, pose) >= groups[g, 3] + gap:
             continue
         j = int(groups[g, 4])
