@@ -147,11 +147,6 @@ EVERY = 3  # the network sees the distances at each third of them
 LINE = 5  # configurations of the straight line at which the scene is encoded
 
 
-def path_basis(curves, knots=KNOTS):
-    """Sines that are zero at both ends: (curves, knots)."""
-    return np.sin(np.pi * np.outer(np.arange(1, curves + 1), np.linspace(0.0, 1.0, knots)))
-
-
 def coefficients(path, basis):
     """Of paths (n, knots, j), what they have of each curve: (n, curves, j)."""
     share = np.linspace(0.0, 1.0, basis.shape[1])[:, None]
@@ -160,19 +155,6 @@ def coefficients(path, basis):
 
 
 # ALGO LOGIC: the network
-class Block(nn.Module):
-    """A residual block."""
-
-    def __init__(self, size, bf16):
-        super().__init__()
-        self.norm = nn.LayerNorm(size)
-        self.first = Bf16Linear(size, size, bf16)
-        self.second = Bf16Linear(size, size, bf16)
-
-    def forward(self, x):
-        return x + self.second(F.silu(self.first(self.norm(x))))
-
-
 class PathNetwork(nn.Module):
     """The path at the flow's end, predicted from a noisy one.
 
@@ -190,18 +172,20 @@ class PathNetwork(nn.Module):
         self.register_buffer("middle", ((high + low) / 2).float())
         self.register_buffer("half_range", ((high - low) / 2).float())
         self.register_buffer("frequencies", math.pi / 2 * torch.arange(1.0, 9.0))
-        size = args.curves * joints
+        size, hidden = args.curves * joints, args.hidden_size
         query_size = 6 * joints + 1 + LINE * (num_spheres + joints)
         path_size = len(range(EVERY, KNOTS - 1, EVERY)) * (num_spheres + joints)
         self.token_in = nn.Linear(3 + 3 * num_spheres, args.token_width)
         self.query_in = nn.Linear(query_size, args.token_width)
         self.fuse = Bf16Linear(args.token_width, args.token_width, args.bf16)
-        self.condition = nn.Linear(query_size + args.token_width, args.hidden_size)
-        self.first = nn.Linear(size + path_size + 16, args.hidden_size)
-        blocks = (Block(args.hidden_size, args.bf16) for _ in range(args.num_blocks))
-        self.blocks = nn.Sequential(*blocks)
-        self.norm = nn.LayerNorm(args.hidden_size)
-        self.head = nn.Linear(args.hidden_size, size)
+        self.condition = nn.Linear(query_size + args.token_width, hidden)
+        self.first = nn.Linear(size + path_size + 16, hidden)
+        self.blocks = nn.ModuleList()
+        for _ in range(args.num_blocks):
+            layers = [Bf16Linear(hidden, hidden, args.bf16) for _ in range(2)]
+            self.blocks.append(nn.Sequential(nn.LayerNorm(hidden), layers[0], nn.SiLU(), layers[1]))
+        self.norm = nn.LayerNorm(hidden)
+        self.head = nn.Linear(hidden, size)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
 
@@ -226,9 +210,11 @@ class PathNetwork(nn.Module):
     def predict(self, condition, noisy, time, distances, uphill):
         """The path's coefficients (n, curves * j), from noisy ones at a time in [0, 1), (n, 1)."""
         phases = time * self.frequencies
-        inputs = [noisy, phases.sin(), phases.cos(), (10.0 * distances).flatten(1)]
+        inputs = [noisy, phases.sin(), phases.cos(), 10.0 * distances.flatten(1)]
         inputs.append((2.0 * uphill).clamp(-3.0, 3.0).flatten(1))
-        x = self.blocks(self.first(torch.cat(inputs, dim=1)) + condition)
+        x = self.first(torch.cat(inputs, dim=1)) + condition
+        for layers in self.blocks:
+            x = x + layers(x)
         # What would be best without a condition: a share of the noisy path.
         share = time / ((1.0 - time) ** 2 + time**2)
         return self.head(F.silu(self.norm(x))) + noisy * share
@@ -236,34 +222,6 @@ class PathNetwork(nn.Module):
     def forward(self, noisy, time, distances, uphill, **query):
         """`predict`; policy.onnx contains this function."""
         return self.predict(self.encode(**query), noisy, time, distances, uphill)
-
-
-# ALGO LOGIC: paths in memory
-class PathPool:
-    """The paths of the last `num_scenes` scenes, and what is observed of the scenes."""
-
-    def __init__(self, num_scenes):
-        self.num_scenes = num_scenes
-        self.num_added = 0
-        self.arrays: dict[str, np.ndarray] = {}  # (num_scenes, ...), allocated with the first scene
-
-    def add(self, arrays):
-        """Add a scene, in place of the oldest when all are there."""
-        if not self.arrays:
-            self.arrays = {
-                name: np.zeros((self.num_scenes, *array.shape), array.dtype)
-                for name, array in arrays.items()
-            }
-        for name, array in arrays.items():
-            self.arrays[name][self.num_added % self.num_scenes] = array
-        self.num_added += 1
-
-    def sample(self, number):
-        """Random paths (number, knots, j) and their scenes (number,), from 16 scenes."""
-        scenes = min(self.num_added, self.num_scenes)
-        scene = torch.randint(scenes, (16,)).repeat_interleave(-(-number // 16))[:number].numpy()
-        row = torch.randint(self.arrays["path"].shape[1], (number,)).numpy()
-        return self.arrays["path"][scene, row], scene
 
 
 LOG_SECONDS = 10  # between two logs of the losses
@@ -298,17 +256,25 @@ if __name__ == "__main__":
     run = Run(args, task_name(args.task), {**state, "progress": progress})
 
     # ALGO LOGIC: data. The pool is not in checkpoints: a resumed run makes the same paths again.
-    basis = path_basis(args.curves)
-    tasks = args.scenes or (args.task,)
-    make_paths = WholePaths(tasks, paths, encoder, args.seed, KNOTS)
-    pool = PathPool(args.pool_scenes)
+    pool: dict[str, np.ndarray] = {}  # (pool_scenes, ...): paths, and what is observed of scenes
+
+    def add_scene(number, arrays):
+        """Add scene `number` to the pool, in place of the oldest when all are there."""
+        for name, array in arrays.items():
+            if name not in pool:
+                pool[name] = np.zeros((args.pool_scenes, *array.shape), array.dtype)
+            pool[name][number % args.pool_scenes] = array
+
+    make_paths = WholePaths(args.scenes or (args.task,), paths, encoder, args.seed, KNOTS)
     num_scenes = args.first_scenes + run.step // args.updates_per_scene
-    pool.num_added = max(num_scenes - args.pool_scenes, 0)
-    scenes = workers.in_order(make_paths, itertools.count(pool.num_added), args.workers)
-    for _ in progress_bar(range(pool.num_added, num_scenes), "roadmaps", unit="scene"):
-        pool.add(next(scenes))
+    oldest = max(num_scenes - args.pool_scenes, 0)
+    scenes = workers.in_order(make_paths, itertools.count(oldest), args.workers)
+    for number in progress_bar(range(oldest, num_scenes), "roadmaps", unit="scene"):
+        add_scene(number, next(scenes))
+    # Sines that are zero at both ends.
+    basis = np.sin(np.pi * np.outer(np.arange(1, args.curves + 1), np.linspace(0.0, 1.0, KNOTS)))
     if run.step == 0:
-        first = pool.arrays["path"][: args.first_scenes].reshape(-1, KNOTS, robot.num_joints)
+        first = pool["path"][: args.first_scenes].reshape(-1, KNOTS, robot.num_joints)
         scale.copy_(torch.from_numpy(coefficients(first, basis).std((0, 2))))
     curves = torch.from_numpy(basis).float() * scale[:, None]  # of whitened coefficients
     line_share = torch.linspace(0.0, 1.0, KNOTS)[:, None]
@@ -323,30 +289,27 @@ if __name__ == "__main__":
         """Distances (n, k, s) and the way out (n, k, j) along paths (n, k, j) of scenes (n,)."""
         rows = np.repeat(scene, path.shape[1])
         states = path.detach().flatten(0, 1).numpy()
-        found = distance_field.distances(states, pool.arrays["field"], rows, hinge)
+        found = distance_field.distances(states, pool["field"], rows, hinge)
         return [torch.from_numpy(one).unflatten(0, path.shape[:2]) for one in found]
 
     # ALGO LOGIC: one update
     def update():
         """One step on a batch of paths. Returns the losses before it."""
-        path, scene = pool.sample(args.batch_size)
-        backwards = torch.rand(len(path), 1, 1) < 0.5
-        path = torch.from_numpy(path)
-        path = torch.where(backwards, path.flip(1), path)
-        target = coefficients(path.numpy(), basis).reshape(len(path), -1)
-        target = torch.from_numpy(target).float() / scale.repeat_interleave(robot.num_joints)
+        # Paths from 16 scenes
+        number, known = args.batch_size, min(num_scenes, args.pool_scenes)
+        scene = torch.randint(known, (16,)).repeat_interleave(-(-number // 16))[:number].numpy()
+        row = torch.randint(pool["path"].shape[1], (number,)).numpy()
+        path = torch.from_numpy(pool["path"][scene, row])
+        path = torch.where(torch.rand(len(path), 1, 1) < 0.5, path.flip(1), path)
+        target = torch.from_numpy(coefficients(path.numpy(), basis)).float().flatten(1)
+        target = target / scale.repeat_interleave(robot.num_joints)
         start, goal = path[:, 0], path[:, -1]
         line = start[:, None] + (goal - start)[:, None] * torch.linspace(0, 1, LINE)[:, None]
-        line_distances, line_uphill = distances_along(line, scene, HINGE)
-        centres = distance_field.centres(line.flatten(0, 1).numpy())
-        condition = network.encode(
-            start,
-            goal,
-            torch.from_numpy(pool.arrays["scene"][scene]),
-            torch.from_numpy(centres).unflatten(0, line.shape[:2]),
-            line_distances,
-            line_uphill,
-        )
+        centres = torch.from_numpy(distance_field.centres(line.flatten(0, 1).numpy()))
+        centres = centres.unflatten(0, line.shape[:2])
+        observed = torch.from_numpy(pool["scene"][scene])
+        line_distances = distances_along(line, scene, HINGE)
+        condition = network.encode(start, goal, observed, centres, *line_distances)
         repeated = [x.repeat_interleave(args.noises, 0) for x in (condition, target, start, goal)]
         condition, target, start, goal = repeated
         scene = scene.repeat(args.noises)
@@ -382,8 +345,7 @@ if __name__ == "__main__":
             origin = {"script": script_name(), "seed": args.seed, "step": run.step}
             form = curves, EVERY, LINE, args.num_points
             save_path_policy(latest, average, args.task, safety_filter, *form, origin)
-            evaluation = {"queries": validation, "workers": max(args.workers, 1)}
-            result = evaluate(latest, args.task, **evaluation)
+            result = evaluate(latest, args.task, queries=validation, workers=max(args.workers, 1))
             run.log({f"eval/{name}": result[name] for name in RESULTS})
             run.show(success=f"{result['success_rate']:.3f}")
             if args.capture_video:
@@ -394,9 +356,8 @@ if __name__ == "__main__":
             if result["success_rate"] >= progress["best"]:
                 progress |= {"best": result["success_rate"], "best_step": run.step}
                 os.replace(latest, run.folder / "policy.onnx")
-        if run.step >= args.total_updates:
-            break
-        if args.stop_at_success is not None and progress["best"] >= args.stop_at_success:
+        enough = 2.0 if args.stop_at_success is None else args.stop_at_success
+        if run.step >= args.total_updates or progress["best"] >= enough:
             break
 
         # ALGO LOGIC: learn, while other processes make the next scene's paths
@@ -406,11 +367,12 @@ if __name__ == "__main__":
         polyak_update(average, network, max(args.policy_average, 1.0 / (run.step + 2)))
         run.advance()
         if run.step % args.updates_per_scene == 0:
-            pool.add(next(scenes))
+            add_scene(num_scenes, next(scenes))
+            num_scenes += 1
         if time.monotonic() - logged > LOG_SECONDS or run.step == 1:
             logged = time.monotonic()
             run.log(losses | {"charts/learning_rate": rate})
-            run.log({"charts/SPS": run.rate, "charts/scenes": pool.num_added})
+            run.log({"charts/SPS": run.rate, "charts/scenes": num_scenes})
         if run.interrupted:
             run.save()
     scenes.close()
