@@ -66,7 +66,7 @@ class DistanceField:
         self._cell = scale_of(robot) * _CELL
         self._low = np.array(robot.base_position) + scale_of(robot) * _LOW
         numbers = self._low, self._cell, self._chain, self._spheres
-        self._single = tuple(np.float32(one) for one in numbers)
+        self._single = [np.float32(one) for one in numbers]
 
     def of_scene(self, points: np.ndarray, scene: Scene) -> np.ndarray:
         """The field of points (n, 3), m, and a scene's table and floor: uint8, `shape`."""
@@ -102,6 +102,7 @@ class DistanceField:
             `uphill`: float32 (m, n), m per unit of normalised configuration: the gradient of the
             sum of the distances below `hinge`.
         """
+        low, cell, chain, spheres = self._single
         states = np.require(states, np.float32, ("C", "W"))
         rows = np.zeros(len(states), np.int64) if rows is None else rows
         distances = np.empty((len(states), self.num_spheres), np.float32)
@@ -110,7 +111,10 @@ class DistanceField:
             states,
             np.require(rows, np.int64, ("C", "W")),
             fields,
-            *self._single,
+            low,
+            cell,
+            chain,
+            spheres,
             np.float32(hinge),
             distances,
             uphill,
