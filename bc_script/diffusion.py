@@ -83,6 +83,9 @@ class Args(RunArgs):
     """actions of a chunk that are executed before the next one is drawn"""
     denoising_steps: flags.Layers = 5
     """steps from noise to a chunk, when the policy acts (Chi et al.: 10 to 100)"""
+    noise_scale: flags.NonNegativeFloat = 1.0
+    """of the noise that the saved policy's chunks are made of; below 1, chunks are nearer to the
+    demonstrations' mean"""
     hindsight: flags.Share = 0.5
     """share of chunks whose goal is a place that their demonstration reaches on its way"""
     policy_average: flags.PositiveShare = 0.001
@@ -156,7 +159,7 @@ class Actor(nn.Module):
         self.head = nn.Sequential(nn.LayerNorm(args.hidden_size), nn.Linear(args.hidden_size, size))
         # Evaluations are to be repeatable, so that every chunk is made of the same noise.
         noise = np.random.default_rng(args.seed).standard_normal((1, size), np.float32)
-        self.register_buffer("noise", torch.from_numpy(noise))
+        self.register_buffer("noise", args.noise_scale * torch.from_numpy(noise))
         self.register_buffer("frequencies", torch.arange(1.0, 9.0))
 
     def velocity(self, noisy, t, condition):
