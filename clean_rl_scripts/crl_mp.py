@@ -524,6 +524,8 @@ if __name__ == "__main__":
             demos = load_demos_for(env, args.demos, args.task)
     # END SHARED
 
+    if args.gamma in (0.0, 1.0):
+        fail("--gamma must be between 0 and 1")
     agent = CRL(args, env, device)
     # SHARED: run, buffers, episodes
     explore = graphed(agent.explore, device)
