@@ -30,7 +30,7 @@ from roboarm_nmp.utils.files import write_atomically
 
 NAME, SEEDS = "moving_obstacles.csv", "moving_obstacles_seeds.csv"
 HEAD = ("task", "method", "obstacles from", "search", "filter", "queries")
-HEAD += ("success", "95 % interval", "collision-free success", "its 95 % interval")
+HEAD += ("success", "95 % interval", "collision-free success")
 SEEDS_HEAD = ("task", "method", "seed", *HEAD[5:])
 POINTS = {"geometry_source": "point_cloud"}
 SOURCES = ("nowhere", "point cloud", "ground truth")
@@ -84,11 +84,9 @@ class Args:
 
 
 def rates_of(result):
-    """Cells of a row: queries, success and collision-free success with their intervals."""
-    cells = [result["num_queries"]]
-    for name in ("success_rate", "collision_free_success_rate"):
-        cells += [share(result[name]), interval(result[f"{name}_interval"])]
-    return cells
+    """Cells of a row: queries, success with its interval, collision-free success."""
+    rates = share(result["success_rate"]), interval(result["success_rate_interval"])
+    return [result["num_queries"], *rates, share(result["collision_free_success_rate"])]
 
 
 def row_of(task, method, result):

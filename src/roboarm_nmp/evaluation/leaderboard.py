@@ -9,7 +9,7 @@ from roboarm_nmp.utils.documents import DocumentError, load_document, plain_data
 COLUMNS = (
     *("method", "success", "95 % interval", "collision-free success", "95 % interval"),
     *("path (rad)", "duration (s)", "jerk (rad/s³)", "s per query", "training seeds"),
-    *("queries, version", "actions"),
+    "queries, version",
 )
 CRITERION = "Motion Policy Networks' criterion"
 """What collision-free success is called where goals are poses, with `POSE_TOLERANCES`."""
@@ -104,7 +104,6 @@ def _line(row: dict[str, Any], numbers: dict[str, Any], task: str) -> str:
         _number(numbers["seconds_per_query"]),
         str(row["training_seeds"]) if row["training_data"] != "none" else "–",
         f"{numbers['num_queries']:,}, `{numbers['queries_digest'][:8]}`",
-        f"`{numbers['sha256'][:8]}`",
     ]
     return "| " + " | ".join(cells) + " |"
 
