@@ -135,7 +135,7 @@ def test_evaluation_takes_the_nearest_free_goal_or_one_with_the_pose(tmp_path):
     beyond = problems[1]._replace(goal_pose=np.array([2.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0]))
     for problem, message in (
         (blocked_only, "all of its goals are in"),
-        (beyond, "cannot be reach"),
+        (beyond, "no collision-free configuration has its goal pose"),
     ):
         write_problems(tmp_path / "a.h5", [problem])
         with pytest.raises(EvaluationError, match=f"problem {problem.name}: .*{message}"):
