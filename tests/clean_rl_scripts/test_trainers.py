@@ -160,7 +160,11 @@ def assert_same_checkpoints(*folders):
 
 
 @pytest.mark.parametrize("device", ["cpu", GPU])
-@pytest.mark.parametrize("name", ["sac_her_mp", "crl_mp", "bc", "gciql", "diffusion"])
+@pytest.mark.parametrize(
+    "name",
+    ["sac_her_mp", "crl_mp", "bc"]
+    + [pytest.param(name, marks=pytest.mark.slow) for name in ("gciql", "diffusion")],
+)
 def test_stopped_and_resumed_run_is_bit_identical_to_an_uninterrupted_one(
     tmp_path, name, device, finished_runs, short_episodes
 ):
