@@ -10,10 +10,10 @@ actions and compares. docs/reference/file_formats.md describes the files.
 
 import functools
 import hashlib
-import importlib.metadata
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -169,7 +169,7 @@ def queries_digest(queries: Queries | Problems) -> str:
 def versions() -> str:
     """The versions that a replay depends on."""
     names = ("roboarm-nmp", "pybullet", "numpy")
-    return ", ".join(f"{name} {importlib.metadata.version(name)}" for name in names)
+    return ", ".join(f"{name} {version(name)}" for name in names)
 
 
 # --- Writing
