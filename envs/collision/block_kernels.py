@@ -34,12 +34,12 @@ from roboarm_nmp.envs.collision.lanes_kernels import (
     spread,
     store,
 )
-from roboarm_nmp.utils.numba_cache import compiled, uncounted
+from roboarm_nmp.utils.numba_cache import compiled, inlined, uncounted
 
 F32 = np.float32
 
 
-@uncounted
+@inlined
 def place_states(start, end, first, step, last, pieces, states):
     """Write states of a motion: number `first`, `first + step`, ..., at most `last`, of `pieces`.
 
@@ -55,7 +55,7 @@ def place_states(start, end, first, step, last, pieces, states):
         )
 
 
-@uncounted
+@inlined
 def margins_of(states, n, margin, growth, endpoint_margins):
     """The margin (m) of each state of a block, as `CollisionChecker.is_free` has them."""
     margins = spread(F32(margin))
@@ -69,7 +69,7 @@ def margins_of(states, n, margin, growth, endpoint_margins):
     return margins
 
 
-@uncounted
+@inlined
 def place_block(states, chain, frames):
     """Write the frames of 16 normalised states. `chain`: that of `arm_hulls`, float32."""
     for i in range(9):
@@ -107,7 +107,7 @@ def place_block(states, chain, frames):
             store(frames, row + 2 * WIDTH, tz)
 
 
-@uncounted
+@inlined
 def place_speeds(rates, chain, frames, speeds):
     """Write how fast the frames of `place_block` move: rows 6 f to 6 f + 5, of origin and rotation.
 

@@ -275,7 +275,7 @@ class CollisionChecker:
             self._blocks[0],
             self._world,
             self._blocks[1],
-            bool(ends_known),
+            0 if ends_known else 2,
             checks.reshape(-1),
         )
         return checks
@@ -307,7 +307,7 @@ class CollisionChecker:
         endpoint_margins: EndpointMargins | None = None,
         reach: float = REACH,
         max_checks: int = 4_000,
-        chords: int = 40,
+        chords: int = 20,
     ) -> tuple[np.ndarray | None, int]:
         """Find a path by RRT-Connect within about `max_checks` checks, which takes milliseconds.
 
@@ -321,7 +321,7 @@ class CollisionChecker:
             margin, clearance, endpoint_margins: as for `is_free`.
             reach: L2, normalised, of the longest edge of a tree.
             max_checks: configurations to check, >= 1. Shortcuts may take a few more.
-            chords: shortcuts to try.
+            chords: random shortcuts to try, and three times as many past single vertices.
 
         Returns:
             The path, float64 (k, n), or None if none was found; and the number of checks.
@@ -351,7 +351,7 @@ class CollisionChecker:
         reach: float = REACH,
         checks: int = 0,
         max_checks: float = math.inf,
-        chords: int = 40,
+        chords: int = 20,
         found: np.ndarray | None = None,
     ) -> tuple[np.ndarray | None, int]:
         """`find_path` for planners, with rules that change during the search.

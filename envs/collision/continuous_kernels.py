@@ -37,6 +37,7 @@ from roboarm_nmp.envs.collision.edge_kernels import (
     CLOUD,
     PAIR,
     block_memory,
+    lanes_left,
     list_near,
     place_bodies,
 )
@@ -353,7 +354,7 @@ def is_motion_clear(
     Margins are those of `CollisionChecker.is_free`, and `TOLERANCE` more. Where they would be kept
     by less than that, the answer is False.
     """
-    block, shapes, _ = block_memory
+    block, shapes, single = block_memory
     states, undecided = block[2], block[3]
     lists, lengths, moves = memory[0], memory[1], memory[11]
     n = start.shape[0]
@@ -376,9 +377,7 @@ def is_motion_clear(
         count = list_near(
             margins, rule[0], rule[1], False, moves, arm[2], arm32, world, shapes, grid, block
         )
-        lanes = 0
-        for i in range(count):
-            lanes |= undecided[i, 2]
+        lanes = lanes_left(count, margins, rule[1], moves, arm, arm32, world, block, single)
         while lanes != 0:
             here = lowest(lanes)
             lanes &= lanes - 1

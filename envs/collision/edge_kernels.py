@@ -31,7 +31,12 @@ from roboarm_nmp.envs.collision.block_kernels import (
     squared_gaps,
     squared_length,
 )
-from roboarm_nmp.envs.collision.gjk_kernels import was_apart, write_body_row
+from roboarm_nmp.envs.collision.gjk_kernels import (
+    gap_along,
+    relative_pose,
+    was_apart,
+    write_body_row,
+)
 from roboarm_nmp.envs.collision.grid_kernels import offsets
 from roboarm_nmp.envs.collision.lanes_kernels import (
     WIDTH,
@@ -46,7 +51,7 @@ from roboarm_nmp.envs.collision.lanes_kernels import (
     store,
 )
 from roboarm_nmp.envs.collision.motion_kernels import is_apart_from_points, margin_of
-from roboarm_nmp.utils.numba_cache import compiled, uncounted
+from roboarm_nmp.utils.numba_cache import compiled, inlined, uncounted
 
 # What is undecided in a block: a body and a shape; or one of these and a pair's index, or a body.
 PAIR, CLOUD = -1, -2
@@ -73,16 +78,17 @@ def block_memory(arm, arm32, world):
         np.zeros(bodies.shape[0] * WIDTH + pairs.shape[0], np.float32),  # moves
         np.empty(arm32[2].shape[0] * 3 * WIDTH, np.float32),  # centres of outer spheres
         np.empty(bodies.shape[0], np.bool_),  # of which bodies they are written
+        np.empty(bodies.shape[0] * columns.shape[0] // (ROW * WIDTH), np.int64),  # masks of shapes
     )
     return block, (rounded, columns), working_memory(chain, bodies)
 
 
 @uncounted
-def check_motion(start, end, ends_known, rule, endpoint_margins, arm, arm32, world, grid, memory):
+def check_motion(start, end, ends, rule, endpoint_margins, arm, arm32, world, grid, memory):
     """How many states of a straight motion were checked; negative if one is not free.
 
-    The start is known to be free, and with `ends_known` the end is, too. The states are those of
-    `CollisionChecker.is_motion_free`, and up to 16 are checked at once.
+    With `ends` 1, the start is known to be free; with 0 the end is, too; with 2 neither is. The
+    states are those of `CollisionChecker.is_motion_free`, and up to 16 are checked at once.
     """
     block, shapes, single = memory
     states, moves = block[2], block[6]
@@ -91,29 +97,32 @@ def check_motion(start, end, ends_known, rule, endpoint_margins, arm, arm32, wor
     for j in range(n):
         squared += (end[j] - start[j]) ** 2
     pieces = max(int(math.ceil(math.sqrt(squared) / rule[3])), 1)
-    last = pieces - 1 if ends_known else pieces
-    blocks = (last + WIDTH - 1) // WIDTH
+    begin, last = 0 if ends == 2 else 1, pieces - 1 if ends == 0 else pieces
+    count = last + 1 - begin
+    blocks = (count + WIDTH - 1) // WIDTH
     checked = 0
     # Each block has states all along the motion; the end comes in the first one.
-    for first in range(blocks, 0, -1):
+    for first in range(begin + blocks - 1, begin - 1, -1):
         place_states(start, end, first, blocks, last, pieces, states)
-        checked = min(checked + WIDTH, last)
+        checked = min(checked + WIDTH, count)
         margins = margins_of(states, n, rule[0], rule[2], endpoint_margins)
         place_bodies(arm32, block)
-        count = list_near(
+        near = list_near(
             margins, rule[0], rule[1], True, moves, arm[2], arm32, world, shapes, grid, block
         )
-        if count == _HIT:
+        if near == _HIT:
             return -checked
-        if count > 0 and not _are_apart(
-            start, end, first, blocks, last, pieces, count, rule, endpoint_margins, arm, world,
-            block, single,
-        ):  # fmt: skip
-            return -checked
+        if near > 0:
+            lanes = lanes_left(near, margins, rule[1], moves, arm, arm32, world, block, single)
+            if lanes != 0 and not _are_apart(
+                start, end, first, blocks, last, pieces, near, lanes, rule, endpoint_margins, arm,
+                world, block, single,
+            ):  # fmt: skip
+                return -checked
     return checked
 
 
-@uncounted
+@inlined
 def place_bodies(arm32, block):
     """Write the frames and the bodies' centres of a block's states."""
     bodies = arm32[1]
@@ -132,7 +141,7 @@ def place_bodies(arm32, block):
         store(centres, (3 * k + 2) * WIDTH, z)
 
 
-@uncounted
+@inlined
 def list_near(margins, most, clearance, hits, moves, pairs, arm32, world, shapes, grid, block):
     """List what spheres do not separate by its margin in the states of `place_bodies`.
 
@@ -180,28 +189,33 @@ def _place_of(points, i):
     return load(points, row), load(points, row + WIDTH), load(points, row + 2 * WIDTH)
 
 
-@uncounted
+@inlined
 def _against_shapes(margins, most, clearance, hits, moves, arm32, rows, shapes, block):
     """List the bodies and shapes that spheres do not settle; their number, or `_HIT`."""
     _, bodies, outer, outer_begin, inner, inner_begin = arm32
     rounded, columns = shapes
-    frames, centres, _, undecided, _, _, _, spheres, _ = block
+    frames, centres, _, undecided, _, _, _, spheres, _, masks = block
     capacity = columns.shape[0] // ROW
     touching = rows.shape[1] > ROW
+    # Shapes near a ball around each body in all 16 states; first of all, as no branch waits for it.
+    for k in range(bodies.shape[0]):
+        cx, cy, cz = _place_of(centres, k)
+        mx, my, mz = lane(cx, WIDTH // 2), lane(cy, WIDTH // 2), lane(cz, WIDTH // 2)
+        move = load(moves, k * WIDTH)
+        moved = largest(root(squared_length(cx - mx, cy - my, cz - mz)) + move)
+        reach = most + bodies[k, ROUNDING] + bodies[k, RADIUS] + moved + F32(1e-6)
+        for begin in range(0, capacity, WIDTH):
+            near = rows_near(columns, capacity, begin, mx, my, mz, reach)
+            masks[(k * capacity + begin) // WIDTH] = near
     count = 0
     for k in range(bodies.shape[0] - 1, -1, -1):  # the hand first: it moves most
         if bodies[k, LINK_ROW] < F32(0.0):  # the base stands where it stands
             continue
         f = int(bodies[k, FRAME])
         cx, cy, cz = _place_of(centres, k)
-        # A ball around the body in all 16 states.
-        mx, my, mz = lane(cx, WIDTH // 2), lane(cy, WIDTH // 2), lane(cz, WIDTH // 2)
-        move = load(moves, k * WIDTH)
-        moved = largest(root(squared_length(cx - mx, cy - my, cz - mz)) + move)
-        reach = most + bodies[k, ROUNDING] + bodies[k, RADIUS] + moved + F32(1e-6)
-        of_body = margins + move + (clearance + bodies[k, ROUNDING])
+        of_body = margins + load(moves, k * WIDTH) + (clearance + bodies[k, ROUNDING])
         for begin in range(0, capacity, WIDTH):
-            near = rows_near(columns, capacity, begin, mx, my, mz, reach)
+            near = masks[(k * capacity + begin) // WIDTH]
             while near != 0:
                 j = begin + lowest(near)
                 near &= near - 1
@@ -236,11 +250,11 @@ def _against_shapes(margins, most, clearance, hits, moves, arm32, rows, shapes, 
     return count
 
 
-@uncounted
+@inlined
 def _against_links(margins, count, moves, pairs, arm32, block):
     """Add the pairs of links that spheres do not settle to the list of `count`; its length."""
     _, bodies, outer, outer_begin, _, _ = arm32
-    _, centres, _, undecided, _, _, _, spheres, _ = block
+    _, centres, _, undecided, _, _, _, spheres, _, _ = block
     of_pairs = bodies.shape[0] * WIDTH
     for p in range(pairs.shape[0]):
         a, b = pairs[p, 0], pairs[p, 1]
@@ -275,7 +289,7 @@ def _against_links(margins, count, moves, pairs, arm32, block):
 def _against_points(margins, count, clearance, moves, arm32, world, grid, block):
     """Add the bodies that may be near a point of the cloud to the list of `count`; its length."""
     _, bodies, outer, outer_begin, _, _ = arm32
-    _, _, states, undecided, _, _, _, spheres, _ = block
+    _, _, states, undecided, _, _, _, spheres, _, _ = block
     near, numbers, place = grid
     ball = world[3]
     nx, ny, nz = numbers[0], numbers[1], numbers[2]
@@ -312,18 +326,76 @@ def _against_points(margins, count, clearance, moves, arm32, world, grid, block)
 
 
 @uncounted
+def lanes_left(count, margins, clearance, moves, arm, arm32, world, block, single):
+    """Take from the list what remembered axes separate; returns the lanes that are left in it.
+
+    Frames in float32 do for that: rounding moves bodies by less than their spheres are larger.
+    """
+    _, bodies, pairs, vertices, cells = arm
+    rows = world[0]
+    _, _, states, undecided, axes, _, _, _, _, _ = block
+    frames, centres, pose, _, other = single
+    slack, of_pairs = arm32[1][0, RADIUS] - bodies[0, RADIUS], bodies.shape[0] * WIDTH
+    own = states[states.shape[0] - WIDTH :]
+    store(own, 0, margins)
+    lanes = 0
+    for i in range(count):
+        k, j, left = undecided[i, 0], undecided[i, 1], undecided[i, 2]
+        axis = bodies.shape[0] * rows.shape[0] + j if k == PAIR else k * rows.shape[0] + j
+        if k == CLOUD or not _is_axis(axes, axis):
+            lanes |= left
+            continue
+        a = pairs[j, 0] if k == PAIR else k
+        f, keep = int(bodies[a, FRAME]), 0
+        while left != 0:
+            here = lowest(left)
+            left &= left - 1
+            _write_pose(bodies, a, here, block, frames, centres)
+            gap = own[here] + bodies[a, ROUNDING] + 2.0 * slack
+            if k == PAIR:
+                b = pairs[j, 1]
+                _write_pose(bodies, b, here, block, frames, centres)
+                write_body_row(bodies, b, frames, centres, other)
+                relative_pose(other, 0, frames, f, centres, a, pose)
+                along = gap_along(vertices, cells, a, other, 0, frames, f, pose, axes, axis)
+                gap += bodies[b, ROUNDING] + moves[of_pairs + j]
+            else:
+                relative_pose(rows, j, frames, f, centres, k, pose)
+                along = gap_along(vertices, cells, k, rows, j, frames, f, pose, axes, axis)
+                gap += clearance + rows[j, 16] + moves[k * WIDTH + here]
+            if along < gap:
+                keep |= 1 << here
+        undecided[i, 2] = keep
+        lanes |= keep
+    return lanes
+
+
+@uncounted
+def _is_axis(axes, n):
+    return axes[n, 0] != 0.0 or axes[n, 1] != 0.0 or axes[n, 2] != 0.0
+
+
+@uncounted
+def _write_pose(bodies, k, here, block, frames, centres):
+    """Write a body's frame and centre in one state of a block."""
+    f = int(bodies[k, FRAME])
+    for i in range(9):  # `relative_pose` needs no position
+        frames[f, i] = block[0][(12 * f + i) * WIDTH + here]
+    for i in range(3):
+        centres[k, i] = block[1][(3 * k + i) * WIDTH + here]
+
+
+@uncounted
 def _are_apart(
-    start, end, first, step, last, pieces, count, rule, endpoint_margins, arm, world, block, single
-):
+    start, end, first, step, last, pieces, count, lanes, rule, endpoint_margins, arm, world, block,
+    single,
+):  # fmt: skip
     """Whether all that is undecided in a block is apart, by GJK, in float64."""
     chain, bodies, pairs, vertices, cells = arm
     rows = world[0]
     frames, centres, pose, s, other = single
-    _, _, _, undecided, axes, q, _, _, _ = block
+    _, _, _, undecided, axes, q, _, _, _, _ = block
     n, shapes = start.shape[0], rows.shape[0]
-    lanes = 0
-    for i in range(count):
-        lanes |= undecided[i, 2]
     before = -1
     while lanes != 0:
         here = lowest(lanes)
@@ -366,9 +438,7 @@ def _are_apart(
 
 
 @compiled
-def motion_batch(
-    starts, stops, rule, endpoint_margins, arm, arm32, world, grid, ends_known, checks
-):
+def motion_batch(starts, stops, rule, endpoint_margins, arm, arm32, world, grid, ends, checks):
     """Write `CollisionChecker.motion_checks` of motions (m, n), (m, n) to `checks` (m,)."""
     memory = block_memory(arm, arm32, world)
     axes = memory[0][4]
@@ -376,19 +446,9 @@ def motion_batch(
         # An answer must not depend on the motions before.
         axes[:] = 0.0
         margins = endpoint_margins[i if endpoint_margins.shape[0] > 1 else 0]
-        if not ends_known and (
-            check_motion(
-                starts[i], starts[i], False, rule, margins, arm, arm32, world, grid, memory
-            )
-            < 0
-        ):
-            checks[i] = -1
-            continue
         checks[i] = check_motion(
-            starts[i], stops[i], ends_known, rule, margins, arm, arm32, world, grid, memory
+            starts[i], stops[i], ends, rule, margins, arm, arm32, world, grid, memory
         )
-        if not ends_known:
-            checks[i] += 1 if checks[i] > 0 else -1
 
 
 @compiled
@@ -400,4 +460,4 @@ def single_motion(
     arm, world = (chain, bodies, pairs, vertices, cells), (rows, points, groups, ball)
     q, stop = np.array(start), np.array(end)
     memory = block_memory(arm, arm32, world)
-    return check_motion(q, stop, False, rule, ends, arm, arm32, world, grid, memory)
+    return check_motion(q, stop, 1, rule, ends, arm, arm32, world, grid, memory)

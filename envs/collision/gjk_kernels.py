@@ -476,25 +476,32 @@ def is_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap)
 
 
 @uncounted
+def gap_along(vertices, cells, k, rows, j, frames, f, pose, axes, n):
+    """A lower bound of the distance (m) of a body's hull from a shape's core, along an axis.
+
+    Row n of `axes` (m, 3) is the axis from the core to the body, in the base's frame. NaN for one
+    of zeros.
+    """
+    x = frames[f, 0] * axes[n, 0] + frames[f, 3] * axes[n, 1] + frames[f, 6] * axes[n, 2]
+    y = frames[f, 1] * axes[n, 0] + frames[f, 4] * axes[n, 1] + frames[f, 7] * axes[n, 2]
+    z = frames[f, 2] * axes[n, 0] + frames[f, 5] * axes[n, 1] + frames[f, 8] * axes[n, 2]
+    px, py, pz, _, _, _ = support(vertices, cells, k, rows, j, pose, -x, -y, -z)
+    return (px * x + py * y + pz * z) / math.sqrt(x * x + y * y + z * z)
+
+
+@uncounted
 def was_apart(bodies, vertices, cells, k, rows, j, frames, centres, pose, s, gap, axes, n):
     """`is_apart` for many similar states of the arm, which is faster.
 
-    Row n of `axes` (m, 3) is the axis from the core to the body, in the base's frame, along which
-    the two were apart before; zeros at first. It is tried first, and written here.
+    Row n of `axes` is the axis of `gap_along` along which the two were apart before; zeros at
+    first. It is tried first, and written here.
     """
     f = int(bodies[k, FRAME])
     relative_pose(rows, j, frames, f, centres, k, pose)
     if both_boxes(bodies, k, rows, j):
         return _are_boxes_apart(bodies, vertices, cells, k, rows, j, pose, s, gap)
-    if axes[n, 0] != 0.0 or axes[n, 1] != 0.0 or axes[n, 2] != 0.0:
-        x = frames[f, 0] * axes[n, 0] + frames[f, 3] * axes[n, 1] + frames[f, 6] * axes[n, 2]
-        y = frames[f, 1] * axes[n, 0] + frames[f, 4] * axes[n, 1] + frames[f, 7] * axes[n, 2]
-        z = frames[f, 2] * axes[n, 0] + frames[f, 5] * axes[n, 1] + frames[f, 8] * axes[n, 2]
-        px, py, pz, _, _, _ = support(vertices, cells, k, rows, j, pose, -x, -y, -z)
-        lower = (px * x + py * y + pz * z) / math.sqrt(x * x + y * y + z * z)
-        if lower >= gap + ROUNDING_ERROR:
-            return True
-    if boxes_apart(bodies, k, rows, j, pose, gap):
+    along = gap_along(vertices, cells, k, rows, j, frames, f, pose, axes, n)
+    if along >= gap + ROUNDING_ERROR or boxes_apart(bodies, k, rows, j, pose, gap):
         return True
     begin_gjk(rows, j, pose, s)
     if gjk(vertices, cells, k, rows, j, pose, s, gap, gap)[0] < gap:

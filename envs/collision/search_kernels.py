@@ -14,6 +14,7 @@ from roboarm_nmp.envs.collision.edge_kernels import block_memory, check_motion
 from roboarm_nmp.envs.collision.lanes_kernels import (
     WIDTH,
     fused,
+    largest,
     less,
     load,
     lowest,
@@ -43,9 +44,12 @@ def _nearest(nodes, columns, tree, count, q):
         # In float32 those that may be nearer, then exactly.
         squared = spread(F32(0.0))
         for j in range(n):
-            away = load(columns, (tree * n + j) * capacity + begin) - F32(q[j])
+            away = load(columns, (tree * capacity + begin) * n + j * WIDTH) - F32(q[j])
             squared = fused(away, away, squared)
         nearer = less(squared, spread(F32(least * (1.0 + 1e-5) + 1e-12)))
+        if nearer != 0 and begin + WIDTH <= count:
+            of_these = -largest(spread(F32(0.0)) - squared)
+            nearer &= less(squared, spread(F32(of_these * (1.0 + 1e-5) + 1e-12)))
         while nearer != 0:
             i = begin + lowest(nearer)
             nearer &= nearer - 1
@@ -60,11 +64,12 @@ def _nearest(nodes, columns, tree, count, q):
 @uncounted
 def _add(nodes, columns, parents, tree, i, q, parent):
     """Make a state node i of a tree."""
-    n, capacity = q.shape[0], nodes.shape[1]
+    n, lane = q.shape[0], i % WIDTH
     parents[tree, i] = parent
+    block = (tree * nodes.shape[1] + i - lane) * n
     for j in range(n):
         nodes[tree, i, j] = q[j]
-        columns[(tree * n + j) * capacity + i] = q[j]
+        columns[block + j * WIDTH + lane] = q[j]
 
 
 @uncounted
@@ -113,7 +118,7 @@ def _search(
             continue
         _towards(nodes[tree, near], target, reach, distance, new)
         more = check_motion(
-            nodes[tree, near], new, False, rule, margins, arm, arm32, world, grid, memory
+            nodes[tree, near], new, 1, rule, margins, arm, arm32, world, grid, memory
         )
         checks += abs(more)
         if (
@@ -144,7 +149,7 @@ def _search(
             while not arrived and size[other] < capacity - WIDTH:
                 arrived = _towards(nodes[other, b], nodes[tree, a], reach, distance, new)
                 more = check_motion(
-                    nodes[other, b], new, False, rule, margins, arm, arm32, world, grid, memory
+                    nodes[other, b], new, 1, rule, margins, arm, arm32, world, grid, memory
                 )
                 checks += abs(more)
                 if more <= 0 or certain and not is_motion_clear(
@@ -161,7 +166,8 @@ def _search(
                 if tree == 1:
                     a, b = b, a
                 return _joined_path(nodes, parents, a, b), checks
-        tree = other
+        if size[tree] >= size[other]:  # the smaller tree grows
+            tree = other
     return np.empty((0, n)), checks
 
 

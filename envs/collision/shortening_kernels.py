@@ -9,6 +9,9 @@ from roboarm_nmp.envs.collision.continuous_kernels import is_motion_clear
 from roboarm_nmp.envs.collision.edge_kernels import check_motion
 from roboarm_nmp.utils.numba_cache import compiled, uncounted
 
+# For each chord, so many corners are cut. L2, normalised: what a shortcut saves at least.
+_CORNERS, _GAIN = 3, 0.02
+
 
 @uncounted
 def random_share(random):
@@ -41,7 +44,7 @@ def _distance(a, b):
 def _is_free(start, end, certain, rule, margins, arm, arm32, world, grid, memories):
     """Number of checks of a motion, negative if it is not free; `certain`: between states, too."""
     memory, continuous, clear_rule = memories
-    checks = check_motion(start, end, False, rule, margins, arm, arm32, world, grid, memory)
+    checks = check_motion(start, end, 1, rule, margins, arm, arm32, world, grid, memory)
     if checks <= 0 or not certain:
         return checks
     is_clear = is_motion_clear(
@@ -66,38 +69,47 @@ def is_path_clear(path, margins, arm, arm32, world, grid, memories):
 def shortened(path, chords, random, certain, rule, margins, arm, arm32, world, grid, memories):
     """A path (k, n) with fewer vertices and shorter, and the number of checks.
 
-    First, of each vertex, the straight motion to the last vertex that it can reach. Then `chords`
-    straight motions between random points of the path, where they are free. With `certain`, they
-    are checked between states, too.
+    First, from each vertex, the straight motion to a vertex far behind it, found by bisection. Then
+    `chords` straight motions between random points of the path, and `_CORNERS` times as many past
+    random vertices, where they are free and save at least `_GAIN`. With `certain`, they are checked
+    between states, too.
     """
     n, count, checks = path.shape[1], path.shape[0], 0
-    path = path.copy()
+    tries = (1 + _CORNERS) * chords
+    points, along = np.empty((count + tries, n)), np.zeros(count + tries)
+    for i in range(count):
+        write_row(points, i, path[i])
     i = 0
     while i < count - 2:
-        for j in range(count - 1, i + 1, -1):
+        free, hit, j = i + 1, count, count - 1
+        while hit - free > 1:
             more = _is_free(
-                path[i], path[j], certain, rule, margins, arm, arm32, world, grid, memories
+                points[i], points[j], certain, rule, margins, arm, arm32, world, grid, memories
             )
             checks += abs(more)
             if more > 0:
-                _move(path, j, count, i + 1)
-                count -= j - i - 1
-                break
+                free = j
+            else:
+                hit = j
+            j = (free + hit) // 2
+        _move(points, free, count, i + 1)
+        count -= free - i - 1
         i += 1
-    # Each chord adds a vertex at most.
-    points, along = np.empty((count + chords, n)), np.zeros(count + chords)
-    for i in range(count):
-        write_row(points, i, path[i])
+    _measure(points, along, count)
     begin, end = np.empty(n), np.empty(n)
-    for _ in range(chords):
+    for number in range(tries):
         if count < 3:
             break
-        for i in range(1, count):
-            along[i] = along[i - 1] + _distance(points[i - 1], points[i])
         one, other = random_share(random), random_share(random)
-        first = _at(points, along, count, min(one, other) * along[count - 1], begin)
-        last = _at(points, along, count, max(one, other) * along[count - 1], end)
-        if first == last:
+        if number < chords:
+            low, high = min(one, other) * along[count - 1], max(one, other) * along[count - 1]
+        else:
+            i = 1 + int(random_share(random) * (count - 2))
+            low = along[i] - one * (along[i] - along[i - 1])
+            high = along[i] + other * (along[i + 1] - along[i])
+        first = _at(points, along, count, low, begin)
+        last = _at(points, along, count, high, end)
+        if first == last or high - low - _distance(begin, end) < _GAIN:
             continue
         more = _is_free(begin, end, certain, rule, margins, arm, arm32, world, grid, memories)
         checks += abs(more)
@@ -107,7 +119,15 @@ def shortened(path, chords, random, certain, rule, margins, arm, arm32, world, g
             write_row(points, first + 1, begin)
             write_row(points, first + 2, end)
             count += 2 - (last - first)
+            _measure(points, along, count)
     return points[:count].copy(), checks
+
+
+@uncounted
+def _measure(points, along, count):
+    """Write the path's length up to each of its vertices."""
+    for i in range(1, count):
+        along[i] = along[i - 1] + _distance(points[i - 1], points[i])
 
 
 @uncounted

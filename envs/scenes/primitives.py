@@ -187,6 +187,7 @@ FLOOR = -0.6
 FRICTION = 0.5  # PyBullet's default
 
 
+@functools.lru_cache(64)
 def floor_box(height: float) -> Box:
     """The floor as a `Box`; `height` (m) is that of its surface."""
     return Box((0.0, 0.0, height - 0.05), (6.0, 6.0, 0.1))

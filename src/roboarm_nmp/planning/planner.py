@@ -33,12 +33,10 @@ from roboarm_nmp.envs.collision.checker import (
     FLOOR,
     POINT,
     REACH,
-    RESOLUTION,
     TABLE,
     CollisionChecker,
     Rules,
 )
-from roboarm_nmp.envs.collision.hulls import MAX_MARGIN
 from roboarm_nmp.envs.robots.inverse_kinematics import NUM_SEEDS, inverse_kinematics
 from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.scenes.primitives import Scene, obstacle_at
@@ -79,8 +77,12 @@ LAG = 10
 # A goal pose is a set of configurations, at most this many. Inverse kinematics begins from
 # `NUM_SEEDS` states; if it finds nothing free, again from 4, 16 and 64 times as many.
 MAX_GOALS, IK_ROUNDS = 16, 4
-# Shortcuts that the compiled planner tries in one round of simplification.
-CHORDS = 60
+# Chords that the compiled planner tries in one round of simplification, and three times as many
+# corners.
+CHORDS = 40
+# L2, normalised: states that the search checks are at most this far apart. The longest edges have
+# 16, which are checked at once.
+SEARCH_RESOLUTION = 0.0251
 
 
 class PlanningError(RuntimeError):
@@ -372,10 +374,7 @@ class Planner:
         """
         ends = np.concatenate([start[None], goals])
         states = np.clip(checker.robot.normalise(ends), -1.0, 1.0).astype(np.float64)
-        within = self.margin + self.clearance + EXACTNESS
-        distances = np.full((2, len(states)), math.inf)
-        if within >= MAX_MARGIN or not checker.is_free(states, margin=within).all():
-            distances = checker.end_distances(states, within)
+        distances = checker.end_distances(states, self.margin + self.clearance + EXACTNESS)
         if self.limits != "urdf" or distances[0].min() < 0.0:
             problems = [self._problem(checker, ends[0], states[0], set())]
             # From a goal, obstacles may move away.
@@ -495,7 +494,7 @@ class Planner:
         near, from_scene = query.distances
         clearance = self.clearance if from_scene.min() >= self.clearance else 0.0
         numbers = _MARGIN_SCALES * (self.margin, clearance, 0.0, 0.0)
-        numbers += (0.0, 0.0, MARGIN_GROWTH, RESOLUTION)
+        numbers += (0.0, 0.0, MARGIN_GROWTH, SEARCH_RESOLUTION)
         endpoints = np.empty((len(numbers), len(query.states), query.states.shape[1] + 1))
         endpoints[:, :, :-1] = query.states
         # Less a hair, because the ends are checked again after normalising, which rounds.
@@ -529,7 +528,8 @@ def _moving_obstacles(scene):
 
 def _length(robot, path):
     """L2, normalised, of a path (k, n), rad."""
-    return float(np.linalg.norm(np.diff(robot.normalise(path), axis=0), axis=1).sum())
+    states = robot.normalise(path).tolist()
+    return sum(map(math.dist, states, states[1:]))
 
 
 def _checked(path, start, goal):

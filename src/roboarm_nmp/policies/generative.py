@@ -44,7 +44,7 @@ REPAIRS, REPAIR_DISTANCE, REPAIR_RATE, MOST_REPAIR = 20, 0.04, 0.3, 0.06
 INACCURACY = 0.01  # m: of a field's distances
 MOST_KNOTS = 1_000  # of a path in a file
 MOST_CHECKED = 40  # times that motions of assembled paths are checked
-CHORDS = 40  # straight motions that are tried to shorten the chosen path
+CHORDS = 20  # straight motions that are tried to shorten the chosen path
 SEARCH_CHECKS = 200_000  # of a search, in each margin
 SLOW_STEPS = 6  # at start and goal: about as far as margins are smaller there
 

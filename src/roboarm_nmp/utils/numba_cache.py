@@ -44,6 +44,13 @@ def uncounted(function):
     return compiled(function, _nrt=False)
 
 
+def inlined(function):
+    """`uncounted`, for functions whose calls cost more than they do: Numba passes an array as seven
+    numbers.
+    """
+    return compiled(function, _nrt=False, forceinline=True)
+
+
 def compiled(function, **options):
     """Numba's `njit`, cached on disk where a folder for that can be written to."""
     if config.DISABLE_JIT:
