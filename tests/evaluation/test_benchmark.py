@@ -18,6 +18,7 @@ from roboarm_nmp.evaluation.submissions import (
     read_actions,
     verify_submission,
 )
+from roboarm_nmp.viewer import show
 
 EXAMPLES = ROOT / "examples" / "benchmark"
 TASKS = ["double_walls", "chased_goals"]
@@ -64,6 +65,13 @@ def test_entry_is_verified_and_its_numbers_are_those_of_an_evaluation(entry, tmp
     table = capsys.readouterr().out
     assert "### `chased_goals`\n" in table and "| go-to-goal | " in table
     assert f"| 6, `{row['tasks']['double_walls']['queries_digest'][:8]}` |" in table
+
+
+def test_episode_of_an_entry_is_shown(entry, tmp_path, capsys):
+    steps = len(read_actions(entry, "chased_goals").of_query(4))
+    flags = ["--entry", str(entry), "--query", "4", "--size", "64", "48"]
+    assert show.main(["chased_goals", *flags, "--output", str(tmp_path / "a.gif")]) == 0
+    assert f"query 4: {steps} steps" in capsys.readouterr().out
 
 
 def test_goal_poses_are_judged_by_the_criterion_of_motion_policy_networks(tmp_path, capsys):

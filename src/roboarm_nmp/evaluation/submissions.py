@@ -46,6 +46,7 @@ from roboarm_nmp.evaluation.evaluate import (
     trajectory_digest,
 )
 from roboarm_nmp.evaluation.rollout import Episode
+from roboarm_nmp.motions.trajectories import Trajectory
 from roboarm_nmp.policies.policy import Method, Policy
 from roboarm_nmp.utils import workers
 from roboarm_nmp.utils.documents import DocumentError, load_document, plain_data
@@ -151,6 +152,17 @@ def benchmark_queries(
         return problem_queries(Path(problems) / f"{task}.h5")
     except (DatasetError, EvaluationError, OSError) as error:
         raise SubmissionError(f"{task}: {error}") from error
+
+
+def queries_of(
+    episodes: TaskActions, problems: str | Path | None = None, split: str = "test"
+) -> Queries | Problems:
+    """The queries of a submission's episodes. Raises SubmissionError: here, they are others."""
+    available = benchmark_queries(episodes.task, problems, split)
+    queries = available[: len(episodes)]
+    if len(queries) < len(episodes) or episodes.queries_digest != queries_digest(queries):
+        raise SubmissionError(f"{episodes.task}: made with other queries or scenes than those here")
+    return queries
 
 
 def _env_task(task: str) -> str:
@@ -406,12 +418,7 @@ def verify_submission(
         episodes = read_actions(folder, task)
         if claims.get("sha256") != hashlib.sha256(path.read_bytes()).hexdigest():
             write_line(f"{path}: changed since submission.yaml was written")
-        available = benchmark_queries(task, problems)
-        if len(episodes) > len(available):
-            raise SubmissionError(f"{path}: {task} has {len(available)} test queries only")
-        queries = available[: len(episodes)]
-        if episodes.queries_digest != queries_digest(queries):
-            raise SubmissionError(f"{path}: made with other queries or scenes than {task} has here")
+        queries = queries_of(episodes, problems)
         try:
             outcomes = _replay_all(path, episodes, queries, num_workers, progress)
         except SubmissionError as error:
@@ -448,7 +455,7 @@ def _replay_all(path, episodes, queries, num_workers, progress) -> list[Outcome]
     """The outcomes of all queries, in their order."""
     count = len(episodes)
     chunks = [range(first, min(first + CHUNK, count)) for first in range(0, count, CHUNK)]
-    make = functools.partial(_Replayer, path.parent, episodes.task, queries)
+    make = functools.partial(Replayer, path.parent, episodes.task, queries)
     if num_workers == 1:
         results = map(make(), chunks)
     else:
@@ -468,8 +475,8 @@ def _replay_all(path, episodes, queries, num_workers, progress) -> list[Outcome]
     return [outcomes[index] for index in range(count)]
 
 
-class _Replayer:
-    """Replays the episodes of a task, chunk by chunk."""
+class Replayer:
+    """Replays the episodes of a task in the folder of a submission."""
 
     def __init__(self, folder: Path, task: str, queries: Queries | Problems):
         self.episodes = read_actions(folder, task)
@@ -486,19 +493,26 @@ class _Replayer:
         """`indices`, and of each query its outcome and what differs from the claim."""
         return indices, [self._replay(index) for index in indices]
 
-    def _replay(self, index: int) -> tuple[Outcome, str | None]:
-        episodes = self.episodes
-        actions = episodes.of_query(index)
-        mistake = None
+    def query(self, index: int) -> Query:
+        """The query of an episode."""
         queries = self.queries
-        query = Query(queries.start[index], queries.goal[index], queries.scenes[index])
-        episode = Episode(self.env, query)
-        for number, action in enumerate(actions):
+        return Query(queries.start[index], queries.goal[index], queries.scenes[index])
+
+    def trajectory(self, index: int) -> Trajectory:
+        """What the actions of an episode lead to, until it ends."""
+        episode = Episode(self.env, self.query(index))
+        for action in self.episodes.of_query(index):
             if episode.ended:
-                mistake = f"it ends after {number} of {len(actions)} actions"
                 break
             episode.step(action)
-        trajectory = episode.trajectory()
+        return episode.trajectory()
+
+    def _replay(self, index: int) -> tuple[Outcome, str | None]:
+        episodes, mistake = self.episodes, None
+        trajectory = self.trajectory(index)
+        steps, count = len(trajectory.actions), len(episodes.of_query(index))
+        if steps < count:
+            mistake = f"it ends after {steps} of {count} actions"
         outcome = episode_outcome(trajectory)
         for name, claims in (("success", episodes.success), ("collision", episodes.collision)):
             if outcome[name] != claims[index]:

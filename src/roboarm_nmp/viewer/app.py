@@ -60,6 +60,7 @@ from roboarm_nmp.viewer.episodes import (
     Episodes,
     cloud_episodes,
     demonstration_episodes,
+    entry_episodes,
     roadmap_episodes,
     task_episodes,
     trajectory_episodes,
@@ -121,6 +122,9 @@ class Args(CloudFlags):
     one, `go-to-goal`, or the recorded motion alone"""
     demos: Path | None = None
     """with `--policy demo`: this file of demonstrations instead of the task's own"""
+    entry: Path | None = None
+    """replay this entry to the benchmark, a folder of `roboarm benchmark run`; --query is one of
+    its queries"""
     trajectory: Path | None = None
     """play this file (.csv, .npz, .json, .yaml; docs/guide/trajectories.md) in the scene of
     --query"""
@@ -754,7 +758,7 @@ def _open_file(args: Args, folder: str, name: str, contents: bytes) -> "tuple[Ar
     if ending in ENDINGS:
         _, robot = split_robot(str(args.task))
         task, cloud = "no_obstacles" if robot is None else f"no_obstacles@{robot}", path
-    args = replace(args, task=task, cloud=cloud, policy=policies, demos=None, query=0)
+    args = replace(args, task=task, cloud=cloud, policy=policies, demos=None, entry=None, query=0)
     return args, _simulation(args)
 
 
@@ -778,21 +782,22 @@ def _check(args: Args):
     flags.check(args)
     if args.demos is not None and DEMO not in args.policy:
         raise ValueError("--demos goes with --policy demo")
+    recordings = (args.trajectory is not None, DEMO in args.policy, args.entry is not None)
     if args.cloud is not None:
         args.task = args.task or "no_obstacles"
-        if DEMO in args.policy:
-            raise ValueError("--cloud goes with a trajectory or a policy: leave out --policy demo")
+        if DEMO in args.policy or args.entry is not None:
+            raise ValueError("--cloud goes with a trajectory or a policy: leave out the recording")
     else:
         check_without_cloud(args)
     if args.task is None:
         raise ValueError("name a task or a scene file, or give --cloud FILE")
     if Path(args.task).is_dir():
-        if DEMO in args.policy or args.trajectory is not None:
-            raise ValueError("demonstrations and --trajectory go with a task, not with a folder")
+        if any(recordings):
+            raise ValueError("a recording goes with a task, not with a folder")
     else:
         envs.get_task(args.task)
-    if DEMO in args.policy and args.trajectory is not None:
-        raise ValueError("--policy demo and --trajectory are both recordings: give one of them")
+    if sum(recordings) > 1:
+        raise ValueError("--trajectory, --policy demo and --entry are recordings: give one of them")
     for policy in args.policy:
         if policy != DEMO and policy not in BASELINES:
             policy_file(policy)  # or it raises
@@ -846,6 +851,8 @@ def _simulation(args: Args) -> "Simulation":
         episodes = cloud_episodes(args.task, args, args.seed, args.trajectory)
     elif Path(args.task).is_dir():
         episodes = roadmap_episodes(args.task)
+    elif args.entry is not None:
+        episodes = entry_episodes(args.task, args.entry)
     elif DEMO in args.policy:
         episodes = demonstration_episodes(args.task, args.demos)
     elif args.trajectory is not None:

@@ -15,6 +15,12 @@ from roboarm_nmp.datasets.queries import Query, load_queries, query_path
 from roboarm_nmp.datasets.roadmap_paths import load_roadmap_paths
 from roboarm_nmp.envs.scenes.primitives import Scene
 from roboarm_nmp.envs.subgoals import subgoals
+from roboarm_nmp.evaluation.submissions import (
+    Replayer,
+    queries_of,
+    read_actions,
+    read_description,
+)
 from roboarm_nmp.motions.trajectories import load_trajectory
 
 MAX_SECONDS = 3600  # of a trajectory from a file
@@ -132,6 +138,22 @@ def demonstration_episodes(task: str, file: Path | None = None) -> Episodes:
         return Query(demo.start, demo.goal, demo.scene), demo.states
 
     return Episodes(task, ("demonstration",), lambda split: len(demos), get, "demonstration")
+
+
+def entry_episodes(task: str, folder: str | Path) -> Episodes:
+    """The `Episodes` of a task in the folder of an entry to the benchmark.
+
+    Raises SubmissionError: it is none, or without this task.
+    """
+    queries = queries_of(read_actions(folder, task), split=read_description(folder)["split"])
+    replayer = Replayer(Path(folder), task, queries)
+    return Episodes(
+        task,
+        ("entry query",),
+        lambda split: len(replayer.episodes),
+        lambda split, number: (replayer.query(number), replayer.trajectory(number).states),
+        "entry",
+    )
 
 
 def problem_episodes(path: str | Path, task: str) -> Episodes:

@@ -9,6 +9,7 @@
     roboarm show wall --policy planner --save-trajectory episode.csv
     roboarm show wall --output episode.gif --trajectory episode.csv
     roboarm show --cloud table.ply --trajectory path.csv --output path.png
+    roboarm show wall --output episode.gif --entry my_entry --query 3
     roboarm show --problems problems.h5 --query 3 --output image.png
 
 The arm is white. The green ball is the goal position of the end effector. Where the goal is a
@@ -47,6 +48,7 @@ from roboarm_nmp.viewer.episodes import (
     Episodes,
     cloud_episodes,
     demonstration_episodes,
+    entry_episodes,
     problem_episodes,
     task_episodes,
     trajectory_episodes,
@@ -70,6 +72,9 @@ class Args(CloudFlags):
     `demo` replays the task's demonstrations; --query is then the number of a demonstration."""
     demos: Path | None = None
     """With `--policy demo`: this file of demonstrations instead of the task's own."""
+    entry: Path | None = None
+    """Replay the episode of --query in this entry to the benchmark, a folder of `roboarm benchmark
+    run`, instead of a policy's."""
     goal_type: Literal["ee", "config", "combined", "pose"] | None = None
     """What the goal is; by default the policy's own, otherwise `combined`. For `ee`, the goal is a
     position: there is no ghost of the arm."""
@@ -102,18 +107,21 @@ class Args(CloudFlags):
 def _check(args: Args):
     """Raises ValueError for arguments that cannot be used, before any work."""
     flags.check(args)
-    is_recording = args.trajectory is not None or args.policy == DEMO
+    recordings = (args.trajectory is not None, args.policy == DEMO, args.entry is not None)
+    if sum(recordings) > 1:
+        raise ValueError("--trajectory, --policy demo and --entry are recordings: give one of them")
+    is_recording = any(recordings)
     if args.demos is not None and args.policy != DEMO:
         raise ValueError("--demos goes with --policy demo")
     if args.problems is not None:
         args.task = "no_obstacles" if args.task is None else args.task
         if is_recording:
             raise ValueError(
-                "--problems goes with a policy, not with a trajectory or demonstrations"
+                "--problems goes with a policy, not with a trajectory, demonstrations or an entry"
             )
     if args.cloud is not None:
         args.task = "no_obstacles" if args.task is None else args.task
-        if args.problems is not None or args.policy == DEMO:
+        if args.problems is not None or args.policy == DEMO or args.entry is not None:
             raise ValueError("--cloud goes with a trajectory or a policy: leave out the recording")
     else:
         check_without_cloud(args)
@@ -152,6 +160,8 @@ def _episodes(args: Args, task: str) -> Episodes:
         return trajectory_episodes(task, args.trajectory, args.seed)
     if args.problems is not None:
         return problem_episodes(args.problems, task)
+    if args.entry is not None:
+        return entry_episodes(task, args.entry)
     if args.policy == DEMO:
         return demonstration_episodes(task, args.demos)
     return task_episodes(task, args.seed)
@@ -161,7 +171,7 @@ def _show(args: Args):
     _check(args)
     task = str(args.task)
     policy, arguments = None, {}
-    if args.policy != DEMO and args.trajectory is None:
+    if args.policy != DEMO and args.trajectory is None and args.entry is None:
         policy, arguments = find_policy(args.policy)
     own_goal_type = arguments.get("goal_type")
     if None not in (own_goal_type, args.goal_type) and own_goal_type != args.goal_type:
