@@ -134,16 +134,22 @@ class CollisionChecker:
         if isinstance(scene, ObservedScene):
             points, point_radius = scene.points, scene.point_radius
         shapes = list(scene.obstacles)
-        geometries = list(range(len(shapes)))
         if scene.table is not None:
             shapes.append(scene.table)
-            geometries.append(TABLE)
         if scene.floor is not None:
             shapes.append(floor_box(scene.floor))
-            geometries.append(FLOOR)
-        self._geometries = np.array([*geometries, ARM, POINT, NOTHING])
         rows, self._arm = world_shapes(shapes, scene.robot)
         self._world = rows, *group_points(points, point_radius)
+
+    @functools.cached_property
+    def _geometries(self):
+        """What `SignedDistances.geometry` calls the shapes, by row."""
+        geometries = list(range(len(self.scene.obstacles)))
+        if self.scene.table is not None:
+            geometries.append(TABLE)
+        if self.scene.floor is not None:
+            geometries.append(FLOOR)
+        return np.array([*geometries, ARM, POINT, NOTHING])
 
     @functools.cached_property
     def _blocks(self):

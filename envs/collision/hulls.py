@@ -353,9 +353,10 @@ def _concat_cells(cells, others, num_vertices):
 def shape_rows(obstacles: Sequence) -> np.ndarray:
     """Obstacles -> float64 (n, `ROW`); `world_shapes` adds the bodies of convex hulls."""
     rows = rows_of_primitives(to_array(obstacles))
-    for obstacle, row in zip(obstacles, rows, strict=True):
+    for number, obstacle in enumerate(obstacles):
         if isinstance(obstacle, ConvexHull):
             centre, mesh, _ = _hull(obstacle.vertices)
+            row = rows[number]
             row[0], row[16] = LINK, BULLET_MARGIN
             row[1:4] += row[4:13].reshape(3, 3) @ centre
             row[13:16] = mesh.max(0)

@@ -465,7 +465,7 @@ def to_array(obstacles: Sequence[Obstacle]) -> np.ndarray:
                 size = (len(obstacle.vertices),) * 3
             else:
                 size = (obstacle.radius, obstacle.radius, obstacle.length)
-        rows.append((_KINDS.index(type(obstacle)), *obstacle.position, *orientation, *size))
+        rows += (_KINDS.index(type(obstacle)), *obstacle.position, *orientation, *size)
     return np.array(rows, np.float64).reshape(-1, ROW)
 
 

@@ -63,7 +63,6 @@ MARGIN_GROWTH = 0.03
 # (Chosen on 1,000 fresh queries of `random_boxes_hard`: docs/benchmark/performance.md.)
 MARGIN_SCHEDULE = ((0, 1.0), (16_000, 0.5), (32_000, 0.25), (64_000, 0.0))
 _RULES_BEGIN = np.array([checks for checks, _ in MARGIN_SCHEDULE])
-_MARGIN_SCALES = np.array([[scale] for _, scale in MARGIN_SCHEDULE])
 # After so many checks without a path, RRT-Connect hands over to another planner for half as many.
 # They alternate, each turn twice as long as the last: LBKPIECE1 quickly finds some paths out of
 # shelves that RRT-Connect does not find.
@@ -373,7 +372,7 @@ class Planner:
         Raises ValueError: the start is not, or no goal is.
         """
         ends = np.concatenate([start[None], goals])
-        states = np.clip(checker.robot.normalise(ends), -1.0, 1.0).astype(np.float64)
+        states = np.maximum(np.minimum(checker.robot.normalise(ends), 1.0), -1.0)
         distances = checker.end_distances(states, self.margin + self.clearance + EXACTNESS)
         if self.limits != "urdf" or distances[0].min() < 0.0:
             problems = [self._problem(checker, ends[0], states[0], set())]
@@ -493,8 +492,12 @@ class Planner:
         """`Rules` with margins that shrink, and are smaller around the ends."""
         near, from_scene = query.distances
         clearance = self.clearance if from_scene.min() >= self.clearance else 0.0
-        numbers = _MARGIN_SCALES * (self.margin, clearance, 0.0, 0.0)
-        numbers += (0.0, 0.0, MARGIN_GROWTH, SEARCH_RESOLUTION)
+        numbers = np.array(
+            [
+                (scale * self.margin, scale * clearance, MARGIN_GROWTH, SEARCH_RESOLUTION)
+                for _, scale in MARGIN_SCHEDULE
+            ]
+        )
         endpoints = np.empty((len(numbers), len(query.states), query.states.shape[1] + 1))
         endpoints[:, :, :-1] = query.states
         # Less a hair, because the ends are checked again after normalising, which rounds.
