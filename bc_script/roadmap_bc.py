@@ -87,7 +87,7 @@ class Args(RunArgs):
     """end at the first evaluation with this success rate on the validation queries"""
 
     # The algorithm
-    total_updates: flags.PositiveInt = 6_000
+    total_updates: flags.PositiveInt = 3_000
     """batches of the whole run"""
     batch_size: flags.PositiveInt = 768
     """examples per batch"""

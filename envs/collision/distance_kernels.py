@@ -431,16 +431,17 @@ def end_distances(states, within, links, arm, world):
     distance, geometry = np.empty((1, links)), np.empty((1, links), np.int64)
     normal, witness = np.empty((1, links, 3)), np.empty((1, links, 3))
     gradient = np.empty((1, links, n))
-    least = np.full((2, m), np.inf)
-    rule, no_endpoints = np.array([within, 0.0, 0.0, 0.0]), np.empty((0, n + 1))
-    memory, state = working_memory(arm[0], arm[1]), np.empty((1, n))
+    least = np.empty((2, m))
+    rule, no_endpoints = np.zeros(4), np.empty((0, n + 1))
+    rule[0] = within
+    memory = working_memory(arm[0], arm[1])
     for i in range(m):
+        least[0, i] = least[1, i] = np.inf
         if is_free(states[i], rule, no_endpoints, arm, world, memory):  # which is much quicker
             continue
-        state[0] = states[i]
         for k in range(2):
             signed_distances_batch(
-                state,
+                states[i : i + 1],
                 k == 0,
                 within,
                 arm,
@@ -451,5 +452,6 @@ def end_distances(states, within, links, arm, world):
                 gradient,
                 geometry,
             )
-            least[k, i] = distance.min()
+            for link in range(links):
+                least[k, i] = min(least[k, i], distance[0, link])
     return least

@@ -91,7 +91,7 @@ def cast_rays(view, q, chain, bodies, surfaces, polyhedra, inverse, classes):
             n = 0
             for i in range(4):
                 if corners[face, i] >= 0:
-                    polygon[0, n] = seen[corners[face, i]]
+                    write_row(polygon[0], n, seen[corners[face, i]])
                     n += 1
             outline = polygon[0]
             if behind > 0:

@@ -173,7 +173,7 @@ class Planner:
         self._checker = geometry_source(env.scene.at(0.0))
         # Compile here what is compiled at its first call: a plan's time is for planning.
         state = np.zeros(env.robot.num_joints)
-        self._checker.is_free(state)
+        self._checker.end_distances(state[None], 0.0)
         if planner == COMPILED:
             self._checker.find_path(state, state, np.random.default_rng(0), max_checks=1)
         self.checks = 0
