@@ -41,7 +41,7 @@ from roboarm_nmp.envs.collision.distance_kernels import (
     link_distances_batch,
     signed_distances_batch,
 )
-from roboarm_nmp.envs.collision.edge_kernels import motion_batch, single_motion
+from roboarm_nmp.envs.collision.edge_kernels import first_free, motion_batch, single_motion
 from roboarm_nmp.envs.collision.grid_kernels import distance_grid
 from roboarm_nmp.envs.collision.hulls import MAX_MARGIN, group_points, world_shapes
 from roboarm_nmp.envs.collision.motion_kernels import free_batch
@@ -285,6 +285,26 @@ class CollisionChecker:
             checks.reshape(-1),
         )
         return checks
+
+    def first_free_path(
+        self,
+        paths: np.ndarray,
+        orders: np.ndarray,
+        margin: float = 0.0,
+        endpoint_margins: EndpointMargins | None = None,
+    ) -> int:
+        """The index of the first of paths (m, k, n) whose motions are free, or m.
+
+        Args:
+            paths: normalised; their first states are known to be free.
+            orders: int64 (m, k - 1): in which order the motions of each path are checked.
+            margin, endpoint_margins: as for `is_motion_free`.
+        """
+        paths = self._states("paths", paths)
+        rule, endpoints = self._rule(margin, 0.0, endpoint_margins)
+        arm32, grid = self._blocks
+        orders = np.ascontiguousarray(orders, np.int64)
+        return first_free(paths, orders, rule, endpoints[0], self._arm, arm32, self._world, grid)
 
     def motion_checker(
         self,

@@ -14,6 +14,7 @@ import numpy as np
 
 from roboarm_nmp.envs.collision.arm_kernels import CENTRE, FRAME, LINK_ROW, RADIUS
 from roboarm_nmp.envs.collision.field_kernels import (
+    box_field,
     fill_field,
     sphere_centres,
     sphere_distances,
@@ -22,7 +23,7 @@ from roboarm_nmp.envs.collision.hulls import arm_hulls, vertex_counts
 from roboarm_nmp.envs.collision.spheres import hull_spheres
 from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.robots.robot import Robot
-from roboarm_nmp.envs.scenes.primitives import Scene, floor_box
+from roboarm_nmp.envs.scenes.primitives import Box, Scene, floor_box
 
 HINGE = 0.08
 """m: by default, the way out is that of spheres nearer than this."""
@@ -63,24 +64,15 @@ class DistanceField:
         self._spheres = arm_spheres(robot)
         self.num_joints = robot.num_joints
         self.num_spheres = len(self._spheres)
-        self._cell = scale_of(robot) * _CELL
-        self._low = np.array(robot.base_position) + scale_of(robot) * _LOW
+        self._low, self._cell = _place_of_grid(robot)
         numbers = self._low, self._cell, self._chain, self._spheres
         self._single = [np.float32(one) for one in numbers]
 
     def of_scene(self, points: np.ndarray, scene: Scene) -> np.ndarray:
         """The field of points (n, 3), m, and a scene's table and floor: uint8, `shape`."""
-        known = []
-        if scene.table is not None:
-            known.append(scene.table)
-        if scene.floor is not None:
-            known.append(floor_box(scene.floor))
-        boxes = np.empty((len(known), 2, 3))
-        for corners, box in zip(boxes, known, strict=True):
-            corners[:] = box.position
-            corners += np.array([[-0.5], [0.5]]) * box.size
+        known = _field_of_known(self._robot, scene.table, scene.floor)
         points = np.require(points, np.float32, ("C", "W"))
-        return fill_field(points, boxes, self._low, self._cell, self.shape)
+        return fill_field(points, known, self._low, self._cell)
 
     def distances(
         self,
@@ -127,3 +119,21 @@ class DistanceField:
         centres = np.empty((len(states), self.num_spheres, 3), np.float32)
         sphere_centres(states, self._chain, self._spheres, centres)
         return centres
+
+
+def _place_of_grid(robot):
+    """Where the first place of a robot's grid is (3,), and how far the others are apart, m."""
+    return np.array(robot.base_position) + scale_of(robot) * _LOW, scale_of(robot) * _CELL
+
+
+@functools.lru_cache(8)
+def _field_of_known(robot: Robot, table: Box | None, floor: float | None) -> np.ndarray:
+    """The field of a scene's table and floor."""
+    known = [] if table is None else [table]
+    if floor is not None:
+        known.append(floor_box(floor))
+    boxes = np.empty((len(known), 2, 3))
+    for corners, box in zip(boxes, known, strict=True):
+        corners[:] = box.position
+        corners += np.array([[-0.5], [0.5]]) * box.size
+    return box_field(boxes, *_place_of_grid(robot), _SIZES)

@@ -311,14 +311,15 @@ def _against_points(margins, count, clearance, moves, arm32, world, grid, block)
             store(own, 0, x)
             store(own, WIDTH, y)
             store(own, 2 * WIDTH, z)
-            reaches = gaps + outer[i, 3] + offsets(x, y, z, place)
+            # (1 um for rounding)
+            reaches = gaps + (outer[i, 3] + F32(1e-6)) + offsets(x, y, z, place)
             for n in range(WIDTH):
                 u, v, w = own[n], own[WIDTH + n], own[2 * WIDTH + n]
-                distance = place[4]  # outside of the grid
+                squared = place[4]  # outside of the grid
                 if u >= 0.0 and v >= 0.0 and w >= 0.0 and u < nx and v < ny and w < nz:
-                    distance = near[(int(u) * ny + int(v)) * nz + int(w)]
-                own[n] = distance
-            left |= less(load(own, 0), reaches)
+                    squared = near[(int(u) * ny + int(v)) * nz + int(w)]
+                own[n] = squared
+            left |= less(load(own, 0), reaches * reaches)
         if left != 0:
             undecided[count, 0], undecided[count, 1], undecided[count, 2] = CLOUD, k, left
             count += 1
@@ -449,6 +450,25 @@ def motion_batch(starts, stops, rule, endpoint_margins, arm, arm32, world, grid,
         checks[i] = check_motion(
             starts[i], stops[i], ends, rule, margins, arm, arm32, world, grid, memory
         )
+
+
+@compiled
+def first_free(paths, orders, rule, endpoint_margins, arm, arm32, world, grid):
+    """`CollisionChecker.first_free_path` of paths (m, k, n)."""
+    memory = block_memory(arm, arm32, world)
+    axes = memory[0][4]
+    for i in range(paths.shape[0]):
+        for step in orders[i]:
+            axes[:] = 0.0  # an answer must not depend on the motions before
+            start, end = paths[i, step], paths[i, step + 1]
+            checks = check_motion(
+                start, end, False, rule, endpoint_margins, arm, arm32, world, grid, memory
+            )
+            if checks <= 0:
+                break
+        else:
+            return i
+    return paths.shape[0]
 
 
 @compiled

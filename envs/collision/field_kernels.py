@@ -30,13 +30,13 @@ STEP = (HIGHEST - LOWEST) / 255.0  # m: they are stored as uint8
 
 
 @compiled
-def fill_field(points, boxes, low, cell, sizes):
-    """The distances of a grid's places from points (n, 3) and boxes (b, 2, 3), m: uint8 (x, y, z).
+def fill_field(points, known, low, cell):
+    """The distances of a grid's places from points (n, 3), m, and what is known: uint8 (x, y, z).
 
-    A box is its lower and upper corner; inside of it, the distance is minus the depth. The first
-    place is at `low` (3,), the others follow every `cell` m.
+    `known`: another field (x, y, z). The first place is at `low` (3,), the others follow every
+    `cell` m.
     """
-    nx, ny, nz = sizes
+    nx, ny, nz = known.shape
     farthest = np.float32(HIGHEST * HIGHEST)
     field = np.full(nx * ny * nz, farthest)
     along = np.empty(WIDTH, np.float32)  # squared distances in a row
@@ -56,11 +56,20 @@ def fill_field(points, boxes, low, cell, sizes):
                     across = np.float32(((a - u) ** 2 + (b - v) ** 2) * cell * cell)
                     if across < farthest:
                         _lower(field, (a * ny + b) * nz + first, across, along)
-    numbers = np.empty((nx, ny, nz), np.uint8)
-    for a in range(nx):
-        for b in range(ny):
-            for c in range(nz):
-                numbers[a, b, c] = _number(math.sqrt(field[(a * ny + b) * nz + c]))
+    numbers = known.copy().reshape(field.shape[0])
+    for i in range(field.shape[0]):
+        if field[i] < farthest:
+            numbers[i] = min(numbers[i], _number(math.sqrt(field[i])))
+    return numbers.reshape((nx, ny, nz))
+
+
+@compiled
+def box_field(boxes, low, cell, sizes):
+    """As `fill_field`, from boxes (b, 2, 3), m: each is its lower and upper corner.
+
+    Inside of a box, the distance is minus the depth.
+    """
+    numbers = np.full(sizes, _number(HIGHEST), np.uint8)
     for i in range(boxes.shape[0]):
         _lower_to_box(numbers, boxes[i], low, cell)
     return numbers

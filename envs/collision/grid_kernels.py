@@ -55,13 +55,17 @@ def _find_cells(points, cell, table, cells, cubes, first, count):
         x = int(math.floor(points[i, 0] / cell))
         y = int(math.floor(points[i, 1] / cell))
         z = int(math.floor(points[i, 2] / cell))
-        slot = _slot(table, cells, x, y, z)
-        if table[slot] < 0:
-            cells[m, 0], cells[m, 1], cells[m, 2], first[m] = x, y, z, i
-            table[slot] = m
-            m += 1
-        cubes[i] = table[slot]
-        count[cubes[i]] += 1
+        # The point before is often in the same cell.
+        k = cubes[i - 1] if i > 0 else -1
+        if k < 0 or cells[k, 0] != x or cells[k, 1] != y or cells[k, 2] != z:
+            slot = _slot(table, cells, x, y, z)
+            k = table[slot]
+            if k < 0:
+                cells[m, 0], cells[m, 1], cells[m, 2], first[m] = x, y, z, i
+                table[slot] = k = m
+                m += 1
+        cubes[i] = k
+        count[k] += 1
     return m
 
 
@@ -153,9 +157,9 @@ def distance_grid(points, farthest, within):
         within: m; bounds matter up to this.
 
     Returns:
-        `near`, float32, the bound of each cell, row-major; `numbers`, int64 (3,), of cells along x,
-        y, z; `place`, float32 (5,): where the first cell begins, cells per m, and what counts as
-        the bound of cells outside of the grid. Without points there are no cells.
+        `near`, float32, the square of each cell's bound, row-major; `numbers`, int64 (3,), of cells
+        along x, y, z; `place`, float32 (5,): where the first cell begins, cells per m, and what
+        counts as the square of cells outside of the grid. Without points there are no cells.
     """
     boxes = np.empty((points.shape[0], 6))
     number = _write_boxes(points, farthest, boxes)
@@ -177,13 +181,11 @@ def distance_grid(points, farthest, within):
         numbers[axis] = int((high[axis] + reach - low[axis]) / cell) + 1
         place[axis] = low[axis]
     numbers[2] = max(numbers[2], WIDTH)
-    place[3], place[4] = 1.0 / cell, reach
-    near = np.full(numbers[0] * numbers[1] * numbers[2], np.float32(reach * reach))  # squared
-    along = np.empty(numbers[2] + WIDTH, np.float32)
+    place[3], place[4] = 1.0 / cell, reach * reach
+    near = np.full(numbers[0] * numbers[1] * numbers[2], place[4])
+    across, along = np.empty(numbers[1]), np.empty(numbers[2] + WIDTH, np.float32)
     for i in range(number):
-        _lower(boxes[i], low, cell, reach, numbers, along, near)
-    for i in range(near.shape[0]):  # (1 um for rounding)
-        near[i] = math.sqrt(near[i]) - np.float32(1e-6)
+        _lower(boxes[i], low, cell, reach, numbers, across, along, near)
     return near, numbers, place
 
 
@@ -208,7 +210,7 @@ def _write_boxes(points, farthest, boxes):
 
 
 @uncounted
-def _lower(box, low, cell, reach, numbers, along, near):
+def _lower(box, low, cell, reach, numbers, across, along, near):
     """Lower squared distances of cells' centres to those from a box."""
     ny, nz = numbers[1], numbers[2]
     begin_a, end_a = _cells_near(box, low, cell, reach, numbers, 0)
@@ -217,10 +219,12 @@ def _lower(box, low, cell, reach, numbers, along, near):
     begin_c = min(begin_c, nz - WIDTH)
     for c in range(begin_c, end_c + WIDTH):
         along[c] = _squared_gap(box, low, cell, 2, c)
+    for b in range(begin_b, end_b):
+        across[b] = _squared_gap(box, low, cell, 1, b)
     for a in range(begin_a, end_a):
-        across = _squared_gap(box, low, cell, 0, a)
+        away = _squared_gap(box, low, cell, 0, a)
         for b in range(begin_b, end_b):
-            squared = across + _squared_gap(box, low, cell, 1, b)
+            squared = away + across[b]
             if squared >= reach * reach:
                 continue
             row = (a * ny + b) * nz

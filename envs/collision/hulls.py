@@ -395,10 +395,14 @@ def group_points(points, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndar
     first, cubes, count = first_in_cells(points, _CUBE_SIZE, False)
     cells = np.floor(points[first] / _CUBE_SIZE).astype(np.int64)
     groups = cells // _GROUP_CUBES
-    order = np.lexsort((*cells.T[::-1], *groups.T[::-1]))
-    group = np.zeros(len(order), np.int64)
-    group[order[1:]] = (np.diff(groups[order], axis=0) != 0).any(1).cumsum()
-    points, groups = group_cubes(points, cubes, order, count, group)
+    x, y, z = (cells - _GROUP_CUBES * groups).T
+    groups -= groups.min(0, initial=0)
+    _, b, c = groups.max(0, initial=0) + 1
+    group = (groups[:, 0] * b + groups[:, 1]) * c + groups[:, 2]
+    order = np.argsort(((group * _GROUP_CUBES + x) * _GROUP_CUBES + y) * _GROUP_CUBES + z)
+    number = np.zeros(len(order), np.int64)
+    number[order[1:]] = (np.diff(group[order]) != 0).cumsum()
+    points, groups = group_cubes(points, cubes, order, count, number)
     ball = np.zeros((1, ROW))
     ball[0, 0], ball[0, 16] = SPHERE, radius
     return points, groups, ball

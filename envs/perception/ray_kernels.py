@@ -334,56 +334,68 @@ def pixels_with_neighbours(depth, hit, distance, least):
 
 
 @compiled
-def mark_seen(points, view, depth, behind, seen):
-    """Mark in `seen`, bool (n,), which points (n, 3), m, are not hidden behind what a sensor sees.
+def pixels_of_points(points, view, width, height, pixels, ahead):
+    """Write the pixel through which a sensor looks at each point, and how far ahead the point is.
 
     Args:
-        points: float64.
+        points: float64 (n, 3), m.
         view: float64 (`VIEW`,).
-        depth: of the sensor's pixels, float32 (height, width), m.
-        behind: m: a point so far behind what a pixel shows is seen.
+        width, height: of the image.
+        pixels: int32 (n,): row * width + column; -1 where the point is outside of the image.
+        ahead: float64 (n,), m.
     """
-    height, width = depth.shape
     across, upwards = 0.5 * width / view[ACROSS], 0.5 * height / view[UPWARDS]
     for i in range(points.shape[0]):
-        if seen[i]:
-            continue
+        pixels[i] = -1
         x, y, z = (
             points[i, 0] - view[EYE],
             points[i, 1] - view[EYE + 1],
             points[i, 2] - view[EYE + 2],
         )
-        ahead = x * view[AXES + 6] + y * view[AXES + 7] + z * view[AXES + 8]
-        if ahead <= view[NEAREST]:
+        ahead[i] = x * view[AXES + 6] + y * view[AXES + 7] + z * view[AXES + 8]
+        if ahead[i] <= view[NEAREST]:
             continue
         right = x * view[AXES] + y * view[AXES + 1] + z * view[AXES + 2]
         up = x * view[AXES + 3] + y * view[AXES + 4] + z * view[AXES + 5]
-        share = 1.0 / ahead
+        share = 1.0 / ahead[i]
         column = int(math.floor(0.5 * width + right * across * share))
         row = int(math.floor(0.5 * height - up * upwards * share))
         if 0 <= column < width and 0 <= row < height:
-            seen[i] = ahead <= depth[row, column] + behind
+            pixels[i] = row * width + column
 
 
 @compiled
-def next_to_seen(seen, places, numbers):
-    """Which places are not seen, but one of the six around them is: bool (n,).
+def mark_seen(pixels, ahead, depth, behind, seen):
+    """Mark in `seen`, bool (n,), which points are not hidden behind what a sensor sees.
+
+    Args:
+        pixels, ahead: of `pixels_of_points`.
+        depth: of the sensor's pixels, float32 (height * width,), m.
+        behind: m: a point so far behind what a pixel shows is seen.
+    """
+    for i in range(pixels.shape[0]):
+        if not seen[i] and pixels[i] >= 0:
+            seen[i] = ahead[i] <= depth[pixels[i]] + behind
+
+
+@compiled
+def next_to_seen(seen, cells, sizes):
+    """Which cells of a grid are not seen, but one of the six around them is: bool (n,).
 
     Args:
         seen: bool (n,).
-        places: int64 (n, 3), of each place in `numbers`.
-        numbers: int32 (a, b, c), the number of the place at each cell of a grid; -1 for none.
+        cells: int32 (n,), row-major indices in the grid, at whose border there are none.
+        sizes: three ints, of the grid.
     """
+    row, slab = sizes[2], sizes[1] * sizes[2]
+    grid = np.zeros(sizes[0] * slab, np.bool_)
+    for i in range(seen.shape[0]):
+        grid[cells[i]] = seen[i]
     chosen = np.zeros(seen.shape[0], np.bool_)
     for i in range(seen.shape[0]):
-        if seen[i]:
-            continue
-        a, b, c = places[i, 0], places[i, 1], places[i, 2]
-        for step in (-1, 1):
-            for other in (
-                numbers[a + step, b, c],
-                numbers[a, b + step, c],
-                numbers[a, b, c + step],
-            ):
-                chosen[i] |= other >= 0 and seen[other]
+        if not seen[i]:
+            c = cells[i]
+            chosen[i] = (grid[c - 1] or grid[c + 1] or grid[c - row] or grid[c + row]) or (
+                grid[c - slab] or grid[c + slab]
+            )
     return chosen

@@ -6,13 +6,19 @@ unobserved_share(scene, states)        # of a motion
 """
 
 import functools
+from typing import NamedTuple
 
 import numpy as np
 
 from roboarm_nmp.envs.collision.distance_field import DistanceField
 from roboarm_nmp.envs.perception.point_clouds import are_near_arm, sensor_images
-from roboarm_nmp.envs.perception.ray_kernels import mark_seen, next_to_seen
-from roboarm_nmp.envs.perception.sensors import SceneObservation, view_of
+from roboarm_nmp.envs.perception.ray_kernels import mark_seen, next_to_seen, pixels_of_points
+from roboarm_nmp.envs.perception.sensors import (
+    PointCloud,
+    SceneObservation,
+    cardinal,
+    view_of,
+)
 from roboarm_nmp.envs.robots.panda import scale_of
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.scenes.primitives import ObservedScene, Scene
@@ -36,19 +42,34 @@ def are_seen(scene: Scene, points: np.ndarray) -> np.ndarray:
     """
     points = np.require(points, np.float64, ("C", "W"))
     seen = np.zeros(len(points), np.bool_)
-    for sensor, depth, _ in sensor_images(scene, None):
-        view = view_of(sensor, sensor.size)
-        mark_seen(points, view, depth, TOLERANCE, seen)
+    _mark_seen(scene, *_sights(scene.robot, points), seen)
     hidden = ~seen
-    seen[hidden] = are_near_arm(points[hidden], scene.robot, _observed(scene), ARM_DISTANCE)
+    of_observation = isinstance(scene, SceneObservation)
+    configuration = scene.configuration if of_observation else scene.robot.observed_pose
+    seen[hidden] = _are_near(points[hidden], scene.robot, configuration)
     return seen
 
 
-def _observed(scene):
-    """The normalised configuration of the arm when a scene was observed: (1, n)."""
-    of_observation = isinstance(scene, SceneObservation)
-    configuration = scene.configuration if of_observation else scene.robot.observed_pose
-    return np.clip(scene.robot.normalise([configuration]), -1.0, 1.0)
+def _mark_seen(scene, pixels, ahead, seen):
+    """Mark which points a sensor of a `Scene` sees, from their `_sights`."""
+    for (_, depth, _), *sight in zip(sensor_images(scene, None), pixels, ahead, strict=True):
+        mark_seen(*sight, depth.ravel(), TOLERANCE, seen)
+
+
+def _sights(robot, points):
+    """`pixels` and `ahead` of `pixels_of_points`, of each sensor: (4, n)."""
+    sensors = cardinal(PointCloud, robot).values()
+    pixels = np.empty((len(sensors), len(points)), np.int32)
+    ahead = np.empty(pixels.shape)
+    for sensor, *written in zip(sensors, pixels, ahead, strict=True):
+        pixels_of_points(points, view_of(sensor, sensor.size), *sensor.size, *written)
+    return pixels, ahead
+
+
+def _are_near(points, robot, configuration):
+    """Which points (n, 3), m, are in or around the arm at joint angles (n, rad): bool (n,)."""
+    state = np.clip(robot.normalise([configuration]), -1.0, 1.0)
+    return are_near_arm(points, robot, state, ARM_DISTANCE)
 
 
 def unseen_points(scene: Scene, states: np.ndarray) -> np.ndarray:
@@ -64,25 +85,45 @@ def unseen_points(scene: Scene, states: np.ndarray) -> np.ndarray:
     """
     if isinstance(scene, ObservedScene):
         return np.empty((0, 3), np.float32)
-    places, cells, numbers = _places(scene.robot.arm)
-    chosen = next_to_seen(are_seen(scene, places), cells, numbers)
-    points = places[chosen].astype(np.float32)
+    places = _places(scene.robot)
+    if isinstance(scene, SceneObservation):
+        seen = are_seen(scene, places.centres)
+    else:
+        seen = places.are_near.copy()
+        _mark_seen(scene, places.pixels, places.ahead, seen)
+    chosen = next_to_seen(seen, places.cells, places.sizes)
+    points = places.centres[chosen].astype(np.float32)
     return points[~are_near_arm(points, scene.robot, states, ARM_DISTANCE)]
 
 
-@functools.lru_cache(8)
-def _places(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centres of cubes in a robot's reach, m, (k, 3); `places`, `numbers` of `next_to_seen`."""
+class _Places(NamedTuple):
+    """Cubes in a robot's reach, and what is the same in every scene.
+
+    centres: float64 (k, 3), m.
+    cells, sizes: of `next_to_seen`.
+    pixels, ahead: of `_sights`.
+    are_near: bool (k,), of the arm in its `observed_pose`.
+    """
+
+    centres: np.ndarray
+    cells: np.ndarray
+    sizes: tuple[int, ...]
+    pixels: np.ndarray
+    ahead: np.ndarray
+    are_near: np.ndarray
+
+
+@functools.lru_cache(2)  # 10 MB each
+def _places(robot: Robot) -> _Places:
     scale = scale_of(robot)
     half = int(_REACH / UNSEEN_CELL) + 1  # (a cube farther, so that each place has six around it)
     along = np.arange(-half, half + 1) * UNSEEN_CELL
     places = np.stack(np.meshgrid(along, along, along, indexing="ij"), -1)
     in_reach = np.linalg.norm(places, axis=-1) <= _REACH
-    cells = np.argwhere(in_reach)
-    numbers = np.full(in_reach.shape, -1, np.int32)
-    numbers[in_reach] = np.arange(len(cells))
-    places = scale * (places[in_reach] + _SHOULDER) + np.array(robot.base_position)
-    return places, cells, numbers
+    centres = scale * (places[in_reach] + _SHOULDER) + np.array(robot.base_position)
+    are_near = _are_near(centres, robot, robot.observed_pose)
+    cells = np.flatnonzero(in_reach).astype(np.int32)
+    return _Places(centres, cells, in_reach.shape, *_sights(robot, centres), are_near)
 
 
 def unobserved_share(scene: Scene, states: np.ndarray) -> float:

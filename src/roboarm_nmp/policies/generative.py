@@ -25,7 +25,13 @@ from roboarm_nmp.envs.perception.geometry_source import (
     cautious_checker,
     fine_observed_checker,
 )
-from roboarm_nmp.envs.perception.point_clouds import DENSE_RAYS, POINT_CLOUD, observed_points
+from roboarm_nmp.envs.perception.point_clouds import (
+    DENSE_RAYS,
+    POINT_CLOUD,
+    observed_points,
+    sensor_images,
+)
+from roboarm_nmp.envs.scenes.primitives import ObservedScene
 from roboarm_nmp.envs.subgoals import subgoals
 from roboarm_nmp.networks.network_file import Network
 from roboarm_nmp.networks.untrusted import NetworkError
@@ -82,6 +88,8 @@ class Generative:
         scene = observed_at_start(self._env, query)
         rng = np.random.default_rng([self._seed, number])
         ends = np.clip(self._robot.normalise([query.start, query.goal]), -1.0, 1.0)
+        if not isinstance(scene, ObservedScene):
+            sensor_images(scene, DENSE_RAYS)  # first: others need no casting then
         draw = self._paths.begin(scene, *ends.astype(np.float32))
         checkers, path, verified, searched = [], ends, False, False
         if self._unknown != "free":
@@ -122,6 +130,7 @@ class PathsOfNetwork:
         self.start, self.goal = start, goal
         self.points = observed_points(scene)
         self._grid = self._field.of_scene(self.points, scene)[None]
+        self._straight = start * (1.0 - self._share) + goal * self._share
         states = start + (goal - start) * np.linspace(0.0, 1.0, self._line)[:, None]
         self._query = {
             "start": start,
@@ -135,9 +144,8 @@ class PathsOfNetwork:
 
     def knots(self, x, which=slice(None)):
         """The paths (m, k, n) of coefficients (m, c, n), or some of their configurations."""
-        share = self._share[which]
         path = np.matmul(self.curves[:, which].T, x)
-        path += self.start * (1.0 - share) + self.goal * share
+        path += self._straight[which]
         return np.clip(path, -1.0, 1.0, out=path)
 
     def draw(self, number, steps, rng):
@@ -177,17 +185,27 @@ class PathsOfNetwork:
 
     def repaired(self, x):
         """Coefficients after gradient steps of the paths away from points."""
-        x = x.copy()
+        number, count, joints = x.shape
         seen = slice(1, -1, 2)
-        smooth = 1.0 / np.arange(1, len(self.curves) + 1, dtype=np.float32)[:, None]
-        scale = (self.curves**2).sum(1)[:, None]
-        rates = 2.0 * REPAIR_RATE * smooth / scale * self.curves[:, seen]
+        straight, at, between = (
+            self._straight[seen, None],
+            self.curves[:, seen].T.copy(),
+            self.curves[:, ::2].T.copy(),
+        )
+        smooth = 1.0 / np.arange(1, count + 1, dtype=np.float32)[:, None]
+        rates = 2.0 * REPAIR_RATE * smooth / (self.curves**2).sum(1)[:, None] * at.T
+        # Curve by curve: then products are of two matrices, for all paths at once.
+        x = x.transpose(1, 0, 2).copy()
         for _ in range(REPAIRS):
-            _, uphill = self._along(self.knots(x, seen), REPAIR_DISTANCE)
-            step = np.matmul(rates, uphill)
-            moves = np.abs(np.matmul(self.curves[:, ::2].T, step)).max((1, 2))
-            x += step * np.minimum(1.0, MOST_REPAIR / np.maximum(moves, 1e-6))[:, None, None]
-        return x
+            states = (at @ x.reshape(count, -1)).reshape(-1, number, joints)
+            states += straight
+            states = np.clip(states, -1.0, 1.0, out=states).reshape(-1, joints)
+            _, uphill = self._field.distances(states, self._grid, hinge=REPAIR_DISTANCE)
+            step = rates @ uphill.reshape(len(at), -1)
+            moves = np.abs(between @ step).reshape(-1, number, joints).max((0, 2))
+            share = np.minimum(1.0, MOST_REPAIR / np.maximum(moves, 1e-6))
+            x += step.reshape(x.shape) * share[:, None]
+        return x.transpose(1, 0, 2).copy()
 
     def lacking(self, x):
         """What the paths of coefficients (m, c, n) lack in distance, summed: (m,)."""
@@ -306,7 +324,7 @@ def search_path(
 
 def _margins_near(checker, ends):
     """For each of `MARGINS`, the smaller margins near start and goal, where there is less room."""
-    room = checker.signed_distances(ends).distance.min(-1) - 1e-5
+    room = checker.signed_distances(ends, within=2.0 * MARGINS[0]).distance.min(-1) - 1e-5
     return [(ends, np.minimum(room, margin), MARGIN_GROWTH) for margin in MARGINS]
 
 
@@ -327,20 +345,18 @@ def _shortest_free(paths, checker, knots, margin, near, rng):
     """The shortest of paths (m, k, n) that keeps a margin, shortened; None if none does."""
     knots = knots[np.argsort(_lengths(knots), kind="stable")]
     clearances = paths.clearances(knots)
-    for path, clearance in zip(knots, clearances, strict=True):
-        if clearance[1:-1].min() < -INACCURACY:
-            continue
-        # The motions with the least distance first, a few at a time.
-        order = np.argsort(np.minimum(clearance[:-1], clearance[1:]), kind="stable")
-        for some in np.array_split(order, (2, 8)):
-            if not checker.is_motion_free(
-                path[some], path[some + 1], margin, endpoint_margins=near
-            ).all():
-                break
-        else:
-            path = _finished(checker, path, margin, near, rng)
-            if path is not None:
-                return path
+    possible = clearances[:, 1:-1].min(1) >= -INACCURACY
+    knots, clearances = knots[possible], clearances[possible]
+    # The motions with the least distance first.
+    orders = np.argsort(np.minimum(clearances[:, :-1], clearances[:, 1:]), kind="stable")
+    while len(knots):
+        free = checker.first_free_path(knots, orders, margin, endpoint_margins=near)
+        if free == len(knots):
+            break
+        path = _finished(checker, knots[free], margin, near, rng)
+        if path is not None:
+            return path
+        knots, orders = knots[free + 1 :], orders[free + 1 :]
     return None
 
 
