@@ -462,7 +462,7 @@ def first_free(paths, orders, rule, endpoint_margins, arm, arm32, world, grid):
             axes[:] = 0.0  # an answer must not depend on the motions before
             start, end = paths[i, step], paths[i, step + 1]
             checks = check_motion(
-                start, end, False, rule, endpoint_margins, arm, arm32, world, grid, memory
+                start, end, 1, rule, endpoint_margins, arm, arm32, world, grid, memory
             )
             if checks <= 0:
                 break

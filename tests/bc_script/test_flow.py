@@ -85,8 +85,7 @@ def test_paths_are_free_in_the_cloud_and_repeatable(run):
         assert np.array_equal(path, again)
         assert np.abs(path[[0, -1]] - ends).max() < 1e-6
         # (The cloud's balls may touch the arm at start and goal already.)
-        room = np.minimum(checker.signed_distances(ends).distance.min(-1) - 1e-5, 0.0)
-        near = (ends, room, 0.05)
+        near = (ends, np.minimum(checker.signed_distances(ends).distance.min(-1) - 1e-5, 0.0), 0.05)
         assert checker.is_motion_free(path[:-1], path[1:], endpoint_margins=near).all()
         verified += is_verified
     assert verified >= 2  # without training, too: draws are repaired
