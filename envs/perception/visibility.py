@@ -52,8 +52,8 @@ def are_seen(scene: Scene, points: np.ndarray) -> np.ndarray:
 
 def _mark_seen(scene, pixels, ahead, seen):
     """Mark which points a sensor of a `Scene` sees, from their `_sights`."""
-    for (_, depth, _), *sight in zip(sensor_images(scene, None), pixels, ahead, strict=True):
-        mark_seen(*sight, depth.ravel(), TOLERANCE, seen)
+    for i, (_, depth, _) in enumerate(sensor_images(scene, None)):
+        mark_seen(pixels[i], ahead[i], depth.ravel(), TOLERANCE, seen)
 
 
 def _sights(robot, points):
@@ -61,8 +61,9 @@ def _sights(robot, points):
     sensors = cardinal(PointCloud, robot).values()
     pixels = np.empty((len(sensors), len(points)), np.int32)
     ahead = np.empty(pixels.shape)
-    for sensor, *written in zip(sensors, pixels, ahead, strict=True):
-        pixels_of_points(points, view_of(sensor, sensor.size), *sensor.size, *written)
+    for i, sensor in enumerate(sensors):
+        view = view_of(sensor, sensor.size)
+        pixels_of_points(points, view, *sensor.size, pixels[i], ahead[i])
     return pixels, ahead
 
 
