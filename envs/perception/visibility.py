@@ -62,8 +62,9 @@ def _sights(robot, points):
     pixels = np.empty((len(sensors), len(points)), np.int32)
     ahead = np.empty(pixels.shape)
     for i, sensor in enumerate(sensors):
+        width, height = sensor.size
         view = view_of(sensor, sensor.size)
-        pixels_of_points(points, view, *sensor.size, pixels[i], ahead[i])
+        pixels_of_points(points, view, width, height, pixels[i], ahead[i])
     return pixels, ahead
 
 
