@@ -129,8 +129,9 @@ def sensor_images(
     of `DENSE_RAYS` in each direction, and not cast again after those.
     """
     sensors = list(cardinal(PointCloud, scene.robot).values())
-    if num_rays is None and scene in _dense:
-        images = [[image[1::2, ::2].copy() for image in pair] for _, *pair in _dense[scene]]
+    dense = _dense.get(scene)  # once: another thread may clear it
+    if num_rays is None and dense is not None:
+        images = [[image[1::2, ::2].copy() for image in pair] for _, *pair in dense]
         return [(sensor, *pair) for sensor, pair in zip(sensors, images, strict=True)]
     if num_rays is not None:
         sensors = [replace(sensor, num_samples=num_rays) for sensor in sensors]

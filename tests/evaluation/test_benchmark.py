@@ -13,11 +13,7 @@ from roboarm_nmp.datasets.problems import load_problems, write_problems
 from roboarm_nmp.evaluation import benchmark
 from roboarm_nmp.evaluation.entrants import EntrantError, FunctionMethod, ProgramMethod
 from roboarm_nmp.evaluation.evaluate import EvaluationError, evaluate
-from roboarm_nmp.evaluation.submissions import (
-    SubmissionError,
-    read_actions,
-    verify_submission,
-)
+from roboarm_nmp.evaluation.submissions import SubmissionError, read_actions, verify_submission
 from roboarm_nmp.viewer import show
 
 EXAMPLES = ROOT / "examples" / "benchmark"

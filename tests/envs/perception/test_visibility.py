@@ -3,7 +3,7 @@
 import numpy as np
 
 from roboarm_nmp.envs.perception.geometry_source import cautious_checker, fine_observed_checker
-from roboarm_nmp.envs.perception.point_clouds import DENSE_RAYS
+from roboarm_nmp.envs.perception.point_clouds import DENSE_RAYS, sensor_images
 from roboarm_nmp.envs.perception.visibility import are_seen, unobserved_share, unseen_points
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.envs.scenes.primitives import Box, Scene
@@ -22,6 +22,10 @@ def test_inside_of_a_closed_box_is_not_seen_and_space_around_it_is():
             position[axis] += side * EDGE / 2
             walls.append(Box(tuple(position), tuple(size)))
     scene = Scene(obstacles=tuple(walls))
+    usual = sensor_images(scene, None)
+    sensor_images.cache_clear()
+    sensor_images(scene, DENSE_RAYS)  # of which the usual ones are a part
+    assert all((a[1] == b[1]).all() for a, b in zip(usual, sensor_images(scene, None), strict=True))
     rng = np.random.default_rng(0)
     inside = CENTRE + rng.uniform(-0.12, 0.12, (300, 3))
     above = rng.uniform((-0.5, -0.5, 0.9), (0.5, 0.5, 1.2), (300, 3))
