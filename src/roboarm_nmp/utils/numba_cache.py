@@ -15,6 +15,7 @@ package's compiled files changes, all of which have names that end in `kernels.p
 import contextlib
 import fcntl
 import functools
+import gc
 import hashlib
 import os
 import pickle
@@ -25,7 +26,7 @@ from pathlib import Path
 
 import numba
 from llvmlite.binding import get_host_cpu_name
-from numba.core import compiler, config, sigutils, types, typing
+from numba.core import compiler, config, event, sigutils, types, typing
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.serialize import dumps
@@ -67,6 +68,28 @@ def compiled(function, **options):
         finally:
             config.CACHE_DIR = folder
     return dispatcher
+
+
+class _WithoutCollector(event.Listener):
+    """While Numba compiles, Python's collector of cycles rests: it takes a tenth of that time."""
+
+    def __init__(self):
+        self._running = 0  # compilations, which may be parts of others
+        self._was_enabled = False
+
+    def on_start(self, event):
+        if self._running == 0:
+            self._was_enabled = gc.isenabled()
+            gc.disable()
+        self._running += 1
+
+    def on_end(self, event):
+        self._running -= 1
+        if self._running == 0 and self._was_enabled:
+            gc.enable()
+
+
+event.register("numba:compile", _WithoutCollector())
 
 
 class _Inner:
