@@ -1,5 +1,6 @@
 import contextlib
 import functools
+import gc
 import importlib.util
 import os
 import random
@@ -61,6 +62,12 @@ def pytest_collection_modifyitems(items):
             item.add_marker("fast")
     ranks = {name: rank for rank, name in enumerate(LONG)}
     items.sort(key=lambda item: ranks.get(item.path.stem, len(LONG)))
+
+
+def pytest_collection_finish():
+    """What all tests have imported is not looked through for garbage again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

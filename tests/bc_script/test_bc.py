@@ -65,7 +65,7 @@ def test_transitions_of_demonstrations_by_hand(goal_type):
 
 def test_policy_overfits_five_demonstrations_and_follows_them(tmp_path, short_episodes):
     flags = (
-        "--num-demos 5 --hidden-size 128 --batch-size 128 --total-updates 4000 --eval-every 4000"
+        "--num-demos 5 --hidden-size 128 --batch-size 128 --total-updates 2000 --eval-every 2000"
     )
     flags += " --task no_obstacles --goal-type combined --learning-rate 3e-3 --policy-average 0.01"
     run = run_script("bc", tmp_path, *flags.split())
@@ -85,14 +85,14 @@ def test_policy_overfits_five_demonstrations_and_follows_them(tmp_path, short_ep
 def test_longer_run_continues_with_a_mixture_from_two_files(tmp_path, short_episodes):
     path = str(demo_path("no_obstacles"))
     flags = ["--num-modes", "2", "--goal-type", "config", "--demos", path, path]
-    flags += ["--total-updates", "1000", "--eval-every", "1000"]
+    flags += ["--total-updates", "100", "--eval-every", "100", "--eval-queries", "1"]
     run = run_script("bc", tmp_path, *flags)
     assert json.loads((run / "args.json").read_text())["demos"] == [path, path]
-    run_here(PATHS["bc"], "--resume", run, "--total-updates", "2000")
-    assert json.loads((run / "result.json").read_text())["steps"] == 2000
+    run_here(PATHS["bc"], "--resume", run, "--total-updates", "200")
+    assert json.loads((run / "result.json").read_text())["steps"] == 200
     rates = EventAccumulator(str(run)).Reload().Scalars("charts/learning_rate")
-    assert [event.step for event in rates] == [1, 1001]  # then every ten seconds
-    assert rates[-1].value == pytest.approx(1e-3 * (1 - 1000 / 2000))
+    assert [event.step for event in rates] == [1, 101]  # then every ten seconds
+    assert rates[-1].value == pytest.approx(1e-3 * (1 - 100 / 200))
 
 
 def test_demonstrations_of_another_task_are_rejected(tmp_path, capsys):

@@ -25,12 +25,13 @@ from roboarm_nmp.policies.registry import PolicyError, make_policy
 from roboarm_nmp.policies.safety_filter import SafetyFilter
 
 HARD = "random_boxes_hard"
+FLAGS = ["--task", HARD, "--eval-queries", "1"]
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     with short_evaluations():
-        return run_script("flow", tmp_path_factory.mktemp("flow"), "--task", HARD)
+        return run_script("flow", tmp_path_factory.mktemp("flow"), *FLAGS)
 
 
 def test_field_has_the_distances_of_points_and_table_and_their_gradient():
@@ -113,24 +114,25 @@ def test_what_cannot_be_verified_is_followed_anyway_and_searched_for_if_allowed(
 def test_stopped_and_resumed_run_is_bit_identical_and_evaluated_as_validated(
     run, tmp_path, short_episodes
 ):
-    stopped = stopped_run(tmp_path, *command("flow", tmp_path, "--task", HARD)[1:])
+    stopped = stopped_run(tmp_path, *command("flow", tmp_path, *FLAGS)[1:])
     run_here(PATHS["flow"], "--resume", stopped)
     one, other = (torch.load(each / "checkpoint.pt", weights_only=True) for each in (run, stopped))
     for name in ("network", "average"):
         assert all(torch.equal(one[name][key], other[name][key]) for key in one[name])
     best = json.loads((run / "result.json").read_text())["validation_success_rate"]
-    result = evaluate(run, HARD, split="validation", num_queries=2)
+    result = evaluate(run, HARD, split="validation", num_queries=1)
     assert result["success_rate"] == best and not result["privileged"]
     assert 0.0 <= result["verified_rate"] <= 1.0 and "search_rate" not in result
-    searched = evaluate(run, HARD, split="validation", num_queries=2, search=True)
+    searched = evaluate(run, HARD, split="validation", num_queries=1, search=True)
     assert searched["verified_rate"] == 1.0 and searched["search_rate"] <= 1.0
-    careful = evaluate(run, HARD, split="validation", num_queries=2, unknown="occupied")
+    careful = evaluate(run, HARD, split="validation", num_queries=1, unknown="occupied")
     assert careful["unknown"] == "occupied"
     assert careful["verified_rate"] <= result["verified_rate"]
 
 
 def test_own_filter_leaves_a_verified_path_as_it_is_where_nothing_moves(run):
-    env = envs.make(HARD, goal_type="combined", geometry_source="point_cloud", link_distances=True)
+    source = {"geometry_source": "point_cloud", "link_distances": True}
+    env = envs.make(HARD, goal_type="combined", horizon=60, **source)
     query = load_queries(HARD, "validation")[0]
     actions = {}
     for name, safety_filter in (("own", None), ("none", False), ("another", SafetyFilter(0.05))):

@@ -40,7 +40,7 @@ def test_gciql_prefers_the_action_that_reaches_the_goal(loss):
     agent = gciql.GCIQL(args, panda_env(), torch.device("cpu"))
     data = SAME | {"next_observation": SAME["observation"], "policy_goal": SAME["goal"]}
     data |= {"terminated": FIRST.float(), "reward": FIRST.float() - 1.0}
-    for _ in range(400):
+    for _ in range(250):
         agent.update(data | {"action": torch.eye(7)[1 - FIRST.long()]})
     good, bad, *_ = agent.actor.mean_action(agent.actor.features(*SAME.values()))[0]
     assert good > bad + 0.3
@@ -52,7 +52,7 @@ def test_diffusion_draws_one_of_two_ways_not_their_mean_and_executes_a_part_of_e
     actor = diffusion.Actor(diffusion.Args(goal_type="ee", bf16=False, **flags), panda_env())
     optimizer = torch.optim.Adam(actor.parameters(), lr=3e-3)
     chunk = 0.01 * torch.where(FIRST, 1.0, -1.0)[:, None, None] * torch.arange(1.0, 5.0)[:, None]
-    for _ in range(500):
+    for _ in range(300):
         diffusion.update(actor, optimizer, SAME | {"chunk": chunk.expand(64, 4, 7)})
     state, executed = torch.zeros(64, actor.recurrent_size), []
     for _ in range(6):

@@ -42,7 +42,7 @@ def test_trainer_learns_to_reach_near_goals(trainer, tmp_path, monkeypatch):
     run = run_script(trainer, tmp_path, *flags.split())
 
     rng, scene = np.random.default_rng(7), envs.get_task("no_obstacles").base_scene
-    queries = [Query(*query(None, rng), scene) for _ in range(60)]
+    queries = [Query(*query(None, rng), scene) for _ in range(40)]
     env = make("no_obstacles", horizon=30)
 
     def success_rate(policy):

@@ -262,10 +262,12 @@ def test_transitions_are_those_of_single_environments_and_failures_inject_demons
     assert [event.value for event in events] == [-8] * 12
 
 
-CLONING = ["--demo-prob", "1", "--bc-weight", "5"]
+CLONING = ["--goal-type", "config", "--demo-prob", "1", "--bc-weight", "5"]
 
 
-def test_cloning_adds_demonstrated_transitions_to_every_batch(tmp_path, demo_file, monkeypatch):
+def test_cloning_adds_demonstrated_transitions_to_every_batch(
+    tmp_path, demo_file, monkeypatch, short_episodes
+):
     calls = {"explore": [], "update_critics": [], "update_actor": []}
 
     def recorded(function, device):
@@ -279,7 +281,7 @@ def test_cloning_adds_demonstrated_transitions_to_every_batch(tmp_path, demo_fil
     # A goal is reached where it is the last of its episode: none is relabelled.
     flags = [*CLONING, "--demos", str(demo_file), "--her-probability", "0", *ONE_EVALUATION]
     run_script("sac_her_mp", tmp_path, *flags)
-    env, demos = panda_env(), load_demos(demo_file)
+    env, demos = panda_env("config"), load_demos(demo_file)
     episodes = [demo_transitions(demo, env) for demo in demos]
     entries = [(transition, episode[-1]) for episode in episodes for transition in episode]
     seen, names = set(), ("observation", "action", "next_observation", "desired_goal")
@@ -297,7 +299,7 @@ def test_cloning_adds_demonstrated_transitions_to_every_batch(tmp_path, demo_fil
     assert len(seen) > 0.5 * min(len(entries), 4 * 128)  # all of them, not the first alone
 
 
-def test_resumed_run_with_cloning_is_the_same(tmp_path, demo_file):
+def test_resumed_run_with_cloning_is_the_same(tmp_path, demo_file, short_episodes):
     # Two files, as one and in parts.
     flags = [*CLONING, "--demos", str(demo_file), str(demo_file)]
     flags += ["--eval-queries", "1", "--test-queries", "0", "--learning-starts", "100"]
