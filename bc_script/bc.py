@@ -31,7 +31,7 @@ from roboarm_nmp.policies.export import save_policy
 from roboarm_nmp.training.arguments import errors_of, parse_args
 from roboarm_nmp.training.cuda_graphs import adam, graphed, set_learning_rate
 from roboarm_nmp.training.final_test import RESULTS, finish, load_task
-from roboarm_nmp.training.network_parts import Bf16Linear, pose_difference
+from roboarm_nmp.training.network_parts import Bf16Linear, polyak_update, pose_difference
 from roboarm_nmp.training.runs import Run, script_name, seed_torch
 from roboarm_nmp.utils import flags
 
@@ -59,9 +59,7 @@ class RunArgs:
     """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
 
 
-# END SHARED
-
-
+# ALGO LOGIC: flags
 @dataclass
 class Args(RunArgs):
     goal_type: Literal["ee", "config", "combined", "pose"] = "combined"
@@ -99,20 +97,7 @@ class Args(RunArgs):
     """updates between evaluations on validation queries"""
 
 
-# ALGO LOGIC: the policy
-# SHARED: averaging
-def polyak_update(target, network, tau):
-    """target <- (1 - tau) target + tau network, all parameters at once."""
-    with torch.no_grad():
-        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage]
-            list(target.parameters()), list(network.parameters()), tau
-        )
-
-
-# END SHARED
-
-
-# SHARED: MLP
+# SHARED: hidden layers
 def mlp(num_inputs, num_outputs, args, layer_norm=False):
     """Hidden layers and a head. The first is in float32: 2 cm need more than bfloat16's 8 bits."""
     size = args.hidden_size
@@ -125,9 +110,7 @@ def mlp(num_inputs, num_outputs, args, layer_norm=False):
     return nn.Sequential(*layers, nn.Linear(size, num_outputs))
 
 
-# END SHARED
-
-
+# ALGO LOGIC: the policy
 class Features(nn.Module):
     """Network inputs: observation, goal and, unless plain, functions of them that ease learning."""
 

@@ -32,7 +32,7 @@ from roboarm_nmp.policies.export import save_policy
 from roboarm_nmp.training.arguments import errors_of, fail, parse_args
 from roboarm_nmp.training.cuda_graphs import adam, graphed, set_learning_rate, to_device
 from roboarm_nmp.training.final_test import RESULTS, finish, load_task
-from roboarm_nmp.training.network_parts import Bf16Linear, GoalFeatures
+from roboarm_nmp.training.network_parts import Bf16Linear, GoalFeatures, polyak_update
 from roboarm_nmp.training.runs import Run, script_name, seed_torch
 from roboarm_nmp.utils import flags
 
@@ -60,9 +60,7 @@ class RunArgs:
     """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
 
 
-# END SHARED
-
-
+# ALGO LOGIC: flags
 @dataclass
 class Args(RunArgs):
     goal_type: Literal["ee", "config", "combined", "pose"] = "combined"
@@ -107,18 +105,6 @@ class Args(RunArgs):
     """points of the encoder `point_cloud`"""
     eval_every: flags.PositiveInt = 25_000
     """updates between evaluations on validation queries"""
-
-
-# SHARED: averaging
-def polyak_update(target, network, tau):
-    """target <- (1 - tau) target + tau network, all parameters at once."""
-    with torch.no_grad():
-        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage]
-            list(target.parameters()), list(network.parameters()), tau
-        )
-
-
-# END SHARED
 
 
 # ALGO LOGIC: the policy
@@ -196,7 +182,6 @@ class Actor(nn.Module):
         return self.scale * chunk[:, :n], later
 
 
-# ALGO LOGIC: data
 # SHARED: demonstrations
 class DemoSteps:
     """The steps of all demonstrations of D one after the other, m rows, float32 (m, ...) each.
@@ -223,9 +208,7 @@ class DemoSteps:
         return np.hstack([observation, self.latents[self.demo[rows]]])
 
 
-# END SHARED
-
-
+# ALGO LOGIC: batches
 def sample(data, args, rng):
     """A dict of float32 arrays: `observation` (N, o), `goal` (N, g), `chunk` (N, k, n).
 

@@ -36,7 +36,7 @@ from roboarm_nmp.policies.safety_filter import SafetyFilter
 from roboarm_nmp.training.arguments import errors_of, fail, parse_args
 from roboarm_nmp.training.cuda_graphs import adam, set_learning_rate
 from roboarm_nmp.training.final_test import RESULTS, finish, load_task
-from roboarm_nmp.training.network_parts import Bf16Linear
+from roboarm_nmp.training.network_parts import Bf16Linear, polyak_update
 from roboarm_nmp.training.runs import Run, script_name, seed_torch
 from roboarm_nmp.utils import flags, workers
 from roboarm_nmp.utils.progress import progress_bar
@@ -65,9 +65,7 @@ class RunArgs:
     """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
 
 
-# END SHARED
-
-
+# ALGO LOGIC: flags
 @dataclass
 class Args(RunArgs):
     task: str = "random_boxes_hard"
@@ -127,18 +125,6 @@ class Args(RunArgs):
 
     eval_every: flags.PositiveInt = 5_000
     """updates between evaluations on validation queries"""
-
-
-# SHARED: averaging
-def polyak_update(target, network, tau):
-    """target <- (1 - tau) target + tau network, all parameters at once."""
-    with torch.no_grad():
-        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage]
-            list(target.parameters()), list(network.parameters()), tau
-        )
-
-
-# END SHARED
 
 
 # ALGO LOGIC: paths

@@ -30,7 +30,7 @@ from roboarm_nmp.policies.export import save_policy
 from roboarm_nmp.training.arguments import errors_of, fail, parse_args
 from roboarm_nmp.training.cuda_graphs import adam, graphed, to_device
 from roboarm_nmp.training.final_test import RESULTS, finish, load_task
-from roboarm_nmp.training.network_parts import Bf16Linear, GoalFeatures
+from roboarm_nmp.training.network_parts import Bf16Linear, GoalFeatures, polyak_update
 from roboarm_nmp.training.runs import Run, script_name, seed_torch
 from roboarm_nmp.utils import flags
 
@@ -58,9 +58,7 @@ class RunArgs:
     """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
 
 
-# END SHARED
-
-
+# ALGO LOGIC: flags
 @dataclass
 class Args(RunArgs):
     goal_type: Literal["ee", "config", "combined", "pose"] = "combined"
@@ -114,20 +112,7 @@ class Args(RunArgs):
     """updates between evaluations on validation queries"""
 
 
-# ALGO LOGIC: networks
-# SHARED: averaging
-def polyak_update(target, network, tau):
-    """target <- (1 - tau) target + tau network, all parameters at once."""
-    with torch.no_grad():
-        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage]
-            list(target.parameters()), list(network.parameters()), tau
-        )
-
-
-# END SHARED
-
-
-# SHARED: MLP
+# SHARED: hidden layers
 def mlp(num_inputs, num_outputs, args, layer_norm=False):
     """Hidden layers and a head. The first is in float32: 2 cm need more than bfloat16's 8 bits."""
     size = args.hidden_size
@@ -140,9 +125,7 @@ def mlp(num_inputs, num_outputs, args, layer_norm=False):
     return nn.Sequential(*layers, nn.Linear(size, num_outputs))
 
 
-# END SHARED
-
-
+# ALGO LOGIC: networks
 class Actor(nn.Module):
     """The mean action; its length is at most `MAX_STEP`, as that of all executed ones."""
 
@@ -175,7 +158,6 @@ class Critics(nn.Module):
         return torch.stack([qf(inputs).squeeze(1) for qf in self.mlps])
 
 
-# ALGO LOGIC: data
 # SHARED: demonstrations
 class DemoSteps:
     """The steps of all demonstrations of D one after the other, m rows, float32 (m, ...) each.
@@ -202,9 +184,7 @@ class DemoSteps:
         return np.hstack([observation, self.latents[self.demo[rows]]])
 
 
-# END SHARED
-
-
+# ALGO LOGIC: batches
 def sample(data, env, args, rng):
     """A dict of float32 arrays (N, ...); `reward` and `terminated` (N,).
 

@@ -24,7 +24,7 @@ import torch.nn.functional as F
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import roboarm_nmp
-from roboarm_nmp.datasets.episodes import DemoQueriesWrapper, demo_transitions, load_demos_for
+from roboarm_nmp.datasets import episodes
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.evaluation.evaluate import evaluate, first_episode_images
@@ -32,7 +32,7 @@ from roboarm_nmp.policies.export import save_policy
 from roboarm_nmp.training.arguments import errors_of, fail, parse_args
 from roboarm_nmp.training.cuda_graphs import adam, graphed, to_device
 from roboarm_nmp.training.final_test import RESULTS, finish, load_task
-from roboarm_nmp.training.network_parts import Bf16Linear, GoalFeatures
+from roboarm_nmp.training.network_parts import Bf16Linear, GoalFeatures, polyak_update
 from roboarm_nmp.training.runs import Run, check_finite, script_name, seed_torch
 from roboarm_nmp.training.vector_envs import async_envs
 from roboarm_nmp.utils import flags
@@ -62,16 +62,11 @@ class RunArgs:
     """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
 
 
-# END SHARED
-
-
 # SHARED: flags of the environment
 @dataclass
 class EnvArgs:
     goal_type: Literal["ee", "config", "combined", "pose"] = "ee"
     """what the goal is: end-effector position, configuration, both, or end-effector pose"""
-    action_mode: Literal["relative", "subgoal"] = "relative"
-    """action: a displacement of the normalised configuration, or the next one itself"""
     velocities: bool = False
     """joint velocities in the observation"""
     encoder: str | None = None
@@ -85,9 +80,7 @@ class EnvArgs:
     gradient, in the observation"""
 
 
-# END SHARED
-
-
+# ALGO LOGIC: flags
 @dataclass
 class Args(RunArgs, EnvArgs):
     num_envs: flags.Environments = 4
@@ -154,20 +147,10 @@ class Args(RunArgs, EnvArgs):
     """stop at this success rate on validation queries, e.g. 0.9; by default never"""
 
 
-# ALGO LOGIC: networks
-# SHARED: averaging
-def polyak_update(target, network, tau):
-    """target <- (1 - tau) target + tau network, all parameters at once."""
-    with torch.no_grad():
-        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage]
-            list(target.parameters()), list(network.parameters()), tau
-        )
+RULES = ("horizon", "stop_on_collision")  # flags that are arguments of `make`
 
 
-# END SHARED
-
-
-# SHARED: MLP
+# SHARED: hidden layers
 def mlp(num_inputs, num_outputs, args, layer_norm=False):
     """Hidden layers and a head. The first is in float32: 2 cm need more than bfloat16's 8 bits."""
     size = args.hidden_size
@@ -180,19 +163,6 @@ def mlp(num_inputs, num_outputs, args, layer_norm=False):
     return nn.Sequential(*layers, nn.Linear(size, num_outputs))
 
 
-# END SHARED
-
-
-# SHARED: action scale
-def action_scale(args):
-    """The policy's actions are in [-scale, scale]."""
-    is_plain = args.plain_networks or args.action_mode == "subgoal"
-    return 1.0 if is_plain else 2.0 * MAX_STEP
-
-
-# END SHARED
-
-
 # SHARED: stochastic policy
 LOG_STD_MIN, LOG_STD_MAX = -5, 2
 
@@ -201,7 +171,7 @@ class Actor(nn.Module):
     def __init__(self, args, env):
         super().__init__()
         self.features = GoalFeatures(env, args.plain_networks, args.jacobian)
-        self.action_scale = action_scale(args)
+        self.action_scale = 1.0 if args.plain_networks else 2.0 * MAX_STEP  # of the longest action
         self.mlp = mlp(self.features.size, 2 * self.features.num_joints, args)
 
     def get_action(self, features):
@@ -224,16 +194,15 @@ class Actor(nn.Module):
         return self.mean_action(self.features(observation, desired_goal))
 
 
-# END SHARED
-
-
+# ALGO LOGIC: critic
 class Critic(nn.Module):
     """Log-probability of reaching a goal after an action, up to a constant."""
 
-    def __init__(self, args, env, features):
+    def __init__(self, args, env, actor):
         super().__init__()
         self.args = args
-        self.features = features  # the actor's, for its constants
+        self.features = features = actor.features  # for its constants
+        self.action_scale = actor.action_scale
         spaces = env.observation_space
         goal = torch.zeros(1, *spaces["desired_goal"].shape)
         state = torch.zeros(1, *spaces["observation"].shape)
@@ -244,13 +213,12 @@ class Critic(nn.Module):
 
     def action_inputs(self, observation, action):
         """(N, o), (N, n) -> (N, size)."""
-        inputs = [observation, action / action_scale(self.args)]
+        inputs = [observation, action / self.action_scale]
         if self.args.plain_networks:
             return torch.cat(inputs, 1)
         features, state = self.features, observation[:, : self.features.num_joints]
         angles = state * features.half_range + features.middle
-        step = action - state if self.args.action_mode == "subgoal" else action
-        step = step * (MAX_STEP / step.norm(dim=1, keepdim=True).clamp_min(MAX_STEP))
+        step = action * (MAX_STEP / action.norm(dim=1, keepdim=True).clamp_min(MAX_STEP))
         step = (state + step).clamp(-1.0, 1.0) - state  # joints stop at their limits
         inputs += [torch.sin(angles), torch.cos(angles), step / MAX_STEP]
         if features.jacobian is not None:
@@ -299,13 +267,17 @@ BUFFER_SIZE = 1_000_000  # transitions; memory is taken as they come
 class HerReplayBuffer:
     """Transitions of finished episodes in a ring; goals are drawn when they are sampled.
 
-    `remaining` counts the transitions that follow one in its episode.
+    `remaining` counts the transitions that follow one in its episode. New episodes overwrite the
+    oldest ones from their start on, so that these transitions outlive it.
     """
 
     def __init__(self, env, capacity, args, rng):
         spaces = env.observation_space
-        sizes = {"observation": spaces["observation"].shape[0], "action": env.action_space.shape[0]}
-        sizes["next_achieved_goal"] = spaces["desired_goal"].shape[0]
+        sizes = {
+            "observation": spaces["observation"].shape[0],
+            "next_achieved_goal": spaces["desired_goal"].shape[0],
+            "action": env.action_space.shape[0],
+        }
         self.arrays: dict[str, np.ndarray] = {}
         for name, size in sizes.items():
             self.arrays[name] = np.zeros((capacity, size), np.float32)
@@ -317,14 +289,16 @@ class HerReplayBuffer:
         self.position = 0
         self.size = 0
 
+    # SHARED: episodes in the buffer
     def add(self, observations, actions, next_observations, collisions, ended):
         """A step of all environments: dicts of arrays (num_envs, ...), and arrays (num_envs, ...).
 
         `next_observations` are those of the same episodes, also where an episode has `ended`.
         """
         for i, episode in enumerate(self.running):
-            step = {"observation": observations["observation"][i], "action": actions[i]}
-            episode.append(step | {"next_achieved_goal": next_observations["achieved_goal"][i]})
+            before = {name: array[i] for name, array in observations.items()}
+            after = {name: array[i] for name, array in next_observations.items()}
+            episode.append(episodes.transition(before, actions[i], after, collisions[i]))
             if ended[i]:
                 self.add_episode(episode)
                 self.running[i] = []
@@ -336,15 +310,17 @@ class HerReplayBuffer:
         self.running = [[] for _ in self.running]
 
     def add_episode(self, transitions):
-        """`transitions`: a list of dicts with the float arrays' names among their keys."""
+        """`transitions`: a list, each as `roboarm_nmp.datasets.episodes.transition` makes them."""
+        if not transitions:
+            return
         index = (self.position + np.arange(len(transitions))) % self.capacity
-        for name, array in self.arrays.items() if transitions else ():
-            if name != "remaining":
-                array[index] = [transition[name] for transition in transitions]
         self.arrays["remaining"][index] = np.arange(len(transitions))[::-1]
+        for name in self.arrays.keys() - {"remaining"}:
+            self.arrays[name][index] = [transition[name] for transition in transitions]
         self.position = (self.position + len(transitions)) % self.capacity
         self.size = min(self.size + len(transitions), self.capacity)
 
+    # ALGO LOGIC: hindsight
     def sample(self, batch_size):
         """A dict of float32 arrays (batch_size, ...): `observation`, `action`, and a `goal`.
 
@@ -359,6 +335,7 @@ class HerReplayBuffer:
         data["goal"] = self.arrays["next_achieved_goal"][(index + later) % self.capacity]
         return data
 
+    # SHARED: batches, state of the buffer
     def batches(self, number, batch_size, device):
         """Yield `number` batches, dicts of tensors; up to 64 are sampled together, for speed."""
         for first in range(0, number, 64):
@@ -378,9 +355,6 @@ class HerReplayBuffer:
             self.arrays[name][: self.size] = array.numpy()
 
 
-RULES = ("horizon", "stop_on_collision")  # flags that are arguments of `make`
-
-
 # SHARED: environments
 def env_arguments(args):
     """The arguments of `roboarm_nmp.make` that a policy is saved with."""
@@ -393,14 +367,7 @@ def make_env(args, demos=None) -> Any:
     rules = {name: getattr(args, name) for name in RULES}
     rules["goal_link_distances"] = False  # relabelled goals would not have them
     env = roboarm_nmp.make(args.task, **env_arguments(args), **rules)
-    return env if demos is None else DemoQueriesWrapper(env, demos)
-
-
-def updates_due(step, args):
-    """Number of updates in the last `num_envs` steps; the first `learning_starts` have none."""
-    begin = max(0, step - args.num_envs - args.learning_starts)
-    end = max(0, step - args.learning_starts)
-    return int(end * args.updates_per_step) - int(begin * args.updates_per_step)
+    return env if demos is None else episodes.DemoQueriesWrapper(env, demos)
 
 
 def reset_seeds(args, step):
@@ -423,17 +390,15 @@ def discount_factor(gamma, robot):
     return 0.98 if (robot.upper - robot.lower).max() >= WHOLE_TURN else 0.95
 
 
-# END SHARED
-
-
 # ALGO LOGIC: networks, optimisers and updates
 LOG_SECONDS = 10  # between two logs of the losses
 DEMO_BATCH_SIZE = 128  # transitions of demonstrations in every batch, with --bc-weight
 POLICY_FREQUENCY = 2  # updates of the critic per update of the policy (JaxGCRL: 1)
 
 
-class CRL:
+class CRL(nn.Module):
     def __init__(self, args, env, device):
+        super().__init__()
         self.args = args
         self.target_entropy = args.target_entropy
         if args.target_entropy == "auto":
@@ -441,14 +406,11 @@ class CRL:
         self.actor = Actor(args, env).to(device)
         self.actor_average = Actor(args, env).to(device).eval()  # evaluated and saved
         self.actor_average.load_state_dict(self.actor.state_dict())
-        self.critic = Critic(args, env, Actor(args, env).features).to(device)
-        self.log_alpha = torch.full((1,), math.log(args.alpha), device=device, requires_grad=True)
-        parameters = [*self.actor.parameters(), self.log_alpha]
-        self.actor_optimizer = adam(parameters, args.learning_rate, device)
+        self.critic = Critic(args, env, Actor(args, env)).to(device)
+        self.log_alpha = nn.Parameter(torch.full((1,), math.log(args.alpha), device=device))
+        actor_parameters = [*self.actor.parameters(), self.log_alpha]
+        self.actor_optimizer = adam(actor_parameters, args.learning_rate, device)
         self.critic_optimizer = adam(self.critic.parameters(), args.learning_rate, device)
-        names = ("actor", "actor_average", "critic", "log_alpha")
-        names += ("actor_optimizer", "critic_optimizer")
-        self.state = {name: getattr(self, name) for name in names}
 
     @torch.no_grad()
     def explore(self, data):
@@ -512,17 +474,16 @@ if __name__ == "__main__":
     args: Any = parse_args(Args, may_change={"total_timesteps", "test_queries", "stop_at_success"})
     device = seed_torch(args)
     validation, test = load_task(args)
-    uses_demos = args.demo_prob is not None
-    if not uses_demos and (args.demos or args.bc_weight > 0):
-        fail("--demos and --bc-weight go with --demo-prob")
     with errors_of("--encoder, --geometry-source, --link-distances"):
         env = make_env(args)  # for its spaces and rewards
     demos: Any = None
-    if uses_demos:
+    if args.demo_prob is not None:
         with errors_of("--demo-prob"):
-            demos = load_demos_for(env, args.demos, args.task)
-    # END SHARED
+            demos = episodes.load_demos_for(env, args.demos, args.task)
+    elif args.demos or args.bc_weight > 0:
+        fail("--demos and --bc-weight go with --demo-prob")
 
+    # ALGO LOGIC: the agent
     if args.gamma in (0.0, 1.0):
         fail("--gamma must be between 0 and 1")
     agent = CRL(args, env, device)
@@ -533,7 +494,9 @@ if __name__ == "__main__":
     rng = np.random.default_rng(args.seed)
     buffer = HerReplayBuffer(env, BUFFER_SIZE, args, rng)
     progress = {"updates": 0, "demos_injected": 0, "evaluated": 0, "best": -1.0, "best_step": 0}
-    state = agent.state | {"buffer": buffer, "rng": rng, "progress": progress}
+    state = {"agent": agent, "buffer": buffer, "rng": rng, "progress": progress}
+    state["actor_optimizer"] = agent.actor_optimizer
+    state["critic_optimizer"] = agent.critic_optimizer
     run = Run(args, task_name(args.task), state)
     makers = [functools.partial(make_env, args, demos)] * args.num_envs
     if device.type == "cuda":  # it would wait for the environments; a CPU computes longer than they
@@ -544,14 +507,12 @@ if __name__ == "__main__":
     if args.bc_weight > 0:
         demo_buffer = HerReplayBuffer(env, int(demos.offsets[-1]), args, rng)
         for demo in progress_bar(demos, "demonstrations", transient=True):
-            demo_buffer.add_episode(demo_transitions(demo, env))
-    observations, infos = envs.reset(seed=reset_seeds(args, run.step))
-    demo_numbers: Any = infos.get("demo")
+            demo_buffer.add_episode(episodes.demo_transitions(demo, env))
+    observations, _ = envs.reset(seed=reset_seeds(args, run.step))
     returns, contacts = np.zeros(args.num_envs), np.zeros(args.num_envs)
     losses = {}
     logged = 0.0
     run.start(args.total_timesteps, "step")
-    # END SHARED
 
     while True:
         # SHARED: evaluate, keep the best policy
@@ -573,13 +534,11 @@ if __name__ == "__main__":
             if result["success_rate"] >= progress["best"]:
                 progress |= {"best": result["success_rate"], "best_step": run.step}
                 os.replace(latest, run.folder / "policy.onnx")
-            observations, infos = envs.reset(seed=reset_seeds(args, run.step))
-            demo_numbers = infos.get("demo")
+            observations, _ = envs.reset(seed=reset_seeds(args, run.step))
             returns[:] = contacts[:] = 0.0
         reached = args.stop_at_success is not None and progress["best"] >= args.stop_at_success
         if run.step >= args.total_timesteps or reached:
             break
-        # END SHARED
 
         # ALGO LOGIC: act
         if run.step < args.learning_starts:
@@ -606,21 +565,20 @@ if __name__ == "__main__":
         contacts += collisions
         for i in np.flatnonzero(ended):
             success = infos["final_info"]["is_success"][i]
-            if uses_demos and not success and rng.random() < args.demo_prob:
-                buffer.add_episode(demo_transitions(demos[int(demo_numbers[i])], env))
+            if demos is not None and not success and rng.random() < args.demo_prob:
+                demo = demos[int(infos["final_info"]["demo"][i])]
+                buffer.add_episode(episodes.demo_transitions(demo, env))
                 progress["demos_injected"] += 1
             steps = infos["final_info"]["elapsed_steps"][i]
             episode = {"episodic_return": returns[i], "episodic_length": steps, "success": success}
             episode["contact_share"] = contacts[i] / steps
             run.log({f"charts/{name}": value for name, value in episode.items()})
             returns[i] = contacts[i] = 0.0
-        if uses_demos and ended.any():
-            demo_numbers = np.where(ended, infos["demo"], demo_numbers)
         observations = next_observations
-        # END SHARED
 
         # SHARED: learn
-        number = updates_due(run.step, args) if buffer.size > 0 else 0
+        updates_due = int(max(0, run.step - args.learning_starts) * args.updates_per_step)
+        number = updates_due - progress["updates"] if buffer.size > 0 else 0
         batches = buffer.batches(number, args.batch_size, device)
         if demo_buffer is not None:
             more = demo_buffer.batches(number, DEMO_BATCH_SIZE, device)
@@ -640,4 +598,3 @@ if __name__ == "__main__":
     envs.close()
     run.save()  # a longer run, which continues this one, knows its best policy
     finish(run, test, progress["best"], progress["best_step"])
-    # END SHARED

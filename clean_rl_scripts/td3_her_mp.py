@@ -6,7 +6,7 @@
 Twin Delayed DDPG (Fujimoto et al., 2018) in CleanRL's form, goals relabelled with the `future`
 strategy (Andrychowicz et al., 2017), demonstrations injected upon failure (TD3-MP), as in the
 paper's sections 2 and 5. For an algorithm of your own, copy this file and change the parts under
-`# ALGO LOGIC`. Parts between `# SHARED` and `# END SHARED` are the same in `sac_her_mp.py`.
+`# ALGO LOGIC`. Parts under `# SHARED` are the same in `sac_her_mp.py`.
 """
 
 import functools
@@ -22,7 +22,7 @@ import torch.nn as nn
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import roboarm_nmp
-from roboarm_nmp.datasets.episodes import DemoQueriesWrapper, demo_transitions, load_demos_for
+from roboarm_nmp.datasets import episodes
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.evaluation.evaluate import evaluate, first_episode_images
@@ -30,7 +30,7 @@ from roboarm_nmp.policies.export import save_policy
 from roboarm_nmp.training.arguments import errors_of, fail, parse_args
 from roboarm_nmp.training.cuda_graphs import adam, graphed, to_device
 from roboarm_nmp.training.final_test import RESULTS, finish, load_task
-from roboarm_nmp.training.network_parts import Bf16Linear, GoalFeatures
+from roboarm_nmp.training.network_parts import Bf16Linear, GoalFeatures, polyak_update
 from roboarm_nmp.training.runs import Run, check_finite, script_name, seed_torch
 from roboarm_nmp.training.vector_envs import async_envs
 from roboarm_nmp.utils import flags
@@ -60,16 +60,11 @@ class RunArgs:
     """log to Weights & Biases as well as to TensorBoard (`pip install wandb`)"""
 
 
-# END SHARED
-
-
 # SHARED: flags of the environment
 @dataclass
 class EnvArgs:
     goal_type: Literal["ee", "config", "combined", "pose"] = "ee"
     """what the goal is: end-effector position, configuration, both, or end-effector pose"""
-    action_mode: Literal["relative", "subgoal"] = "relative"
-    """action: a displacement of the normalised configuration, or the next one itself"""
     velocities: bool = False
     """joint velocities in the observation"""
     encoder: str | None = None
@@ -83,9 +78,7 @@ class EnvArgs:
     gradient, in the observation"""
 
 
-# END SHARED
-
-
+# ALGO LOGIC: flags
 @dataclass
 class Args(RunArgs, EnvArgs):
     num_envs: flags.Environments = 4
@@ -116,8 +109,7 @@ class Args(RunArgs, EnvArgs):
     """demonstration files of the task, to use with --demo-prob; by default the task's own"""
     bc_weight: flags.NonNegativeFloat = 0.0
     """with --demo-prob, weight of behavioural cloning in the policy's loss: the squared difference
-    from demonstrated actions, in units of the action scale (Fujimoto and Gu, 2021, who also divide
-    the value in the loss by the mean of its magnitude; here it is not)"""
+    from demonstrated actions, in units of the action scale"""
     gamma: flags.Share | Literal["auto"] = "auto"
     """discount factor (CleanRL: 0.99); `auto`: 0.95, and 0.98 for arms with a joint that turns all
     the way round, as an arm at its limit may have to"""
@@ -149,20 +141,10 @@ class Args(RunArgs, EnvArgs):
     """stop at this success rate on validation queries, e.g. 0.9; by default never"""
 
 
-# ALGO LOGIC: networks
-# SHARED: averaging
-def polyak_update(target, network, tau):
-    """target <- (1 - tau) target + tau network, all parameters at once."""
-    with torch.no_grad():
-        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage]
-            list(target.parameters()), list(network.parameters()), tau
-        )
+RULES = ("horizon", "stop_on_collision", "contact_cost")  # flags that are arguments of `make`
 
 
-# END SHARED
-
-
-# SHARED: MLP
+# SHARED: hidden layers
 def mlp(num_inputs, num_outputs, args, layer_norm=False):
     """Hidden layers and a head. The first is in float32: 2 cm need more than bfloat16's 8 bits."""
     size = args.hidden_size
@@ -175,27 +157,14 @@ def mlp(num_inputs, num_outputs, args, layer_norm=False):
     return nn.Sequential(*layers, nn.Linear(size, num_outputs))
 
 
-# END SHARED
-
-
-# SHARED: action scale
-def action_scale(args):
-    """The policy's actions are in [-scale, scale]."""
-    is_plain = args.plain_networks or args.action_mode == "subgoal"
-    return 1.0 if is_plain else 2.0 * MAX_STEP
-
-
-# END SHARED
-
-
 # SHARED: critics
 class Critics(nn.Module):
     """Q1 and Q2."""
 
-    def __init__(self, args, features):
+    def __init__(self, args, actor):
         super().__init__()
-        self.action_scale = action_scale(args)
-        size = features.size + features.num_joints
+        self.action_scale = actor.action_scale
+        size = actor.features.size + actor.features.num_joints
         layer_norm = not args.plain_networks
         self.mlps = nn.ModuleList(mlp(size, 1, args, layer_norm) for _ in range(2))
 
@@ -205,14 +174,12 @@ class Critics(nn.Module):
         return torch.stack([qf(inputs).squeeze(-1) for qf in self.mlps[:number]])
 
 
-# END SHARED
-
-
+# ALGO LOGIC: policy
 class Actor(nn.Module):
     def __init__(self, args, env):
         super().__init__()
         self.features = GoalFeatures(env, args.plain_networks, args.jacobian)
-        self.action_scale = action_scale(args)
+        self.action_scale = 1.0 if args.plain_networks else 2.0 * MAX_STEP  # of the longest action
         self.mlp = mlp(self.features.size, self.features.num_joints, args)
 
     def get_action(self, features):
@@ -225,7 +192,6 @@ class Actor(nn.Module):
         return self.get_action(self.features(observation, desired_goal))[0]
 
 
-# ALGO LOGIC: replay buffer
 # SHARED: replay buffer
 BUFFER_SIZE = 1_000_000  # transitions; memory is taken as they come
 
@@ -234,31 +200,23 @@ class HerReplayBuffer:
     """Transitions of finished episodes in a ring; goals are relabelled when they are sampled.
 
     `remaining` counts the transitions that follow one in its episode. New episodes overwrite the
-    oldest ones from their start on, so that these transitions outlive it. The encoded scene at the
-    end of an observation is stored once: `latents[latent]`; of the next one `latents[next_latent]`.
+    oldest ones from their start on, so that these transitions outlive it.
     """
 
     def __init__(self, env, capacity, args, rng):
         spaces = env.observation_space
-        encoder = getattr(env, "encoder", None)
-        latent_size = 0 if encoder is None else encoder.size
-        observation_size = spaces["observation"].shape[0] - latent_size
-        goal_size = spaces["desired_goal"].shape[0]
         sizes = {
-            "observation": observation_size,
-            "next_observation": observation_size,
-            "next_achieved_goal": goal_size,
-            "desired_goal": goal_size,
+            "observation": spaces["observation"].shape[0],
+            "next_observation": spaces["observation"].shape[0],
+            "next_achieved_goal": spaces["desired_goal"].shape[0],
+            "desired_goal": spaces["desired_goal"].shape[0],
             "action": env.action_space.shape[0],
-            "collision": 1,
         }
         self.arrays: dict[str, np.ndarray] = {}
         for name, size in sizes.items():
             self.arrays[name] = np.zeros((capacity, size), np.float32)
-        for name in ("remaining", "latent", "next_latent"):
-            self.arrays[name] = np.zeros(capacity, np.int32)
-        self.latents = np.zeros((1, latent_size), np.float32)
-        self.latent_numbers = {}
+        self.arrays["collision"] = np.zeros(capacity, bool)
+        self.arrays["remaining"] = np.zeros(capacity, np.int32)
         self.compute_reward = env.get_wrapper_attr("compute_reward")
         self.compute_terminated = env.get_wrapper_attr("compute_terminated")
         self.capacity = capacity
@@ -268,21 +226,16 @@ class HerReplayBuffer:
         self.position = 0
         self.size = 0
 
+    # SHARED: episodes in the buffer
     def add(self, observations, actions, next_observations, collisions, ended):
         """A step of all environments: dicts of arrays (num_envs, ...), and arrays (num_envs, ...).
 
         `next_observations` are those of the same episodes, also where an episode has `ended`.
         """
-        step = {
-            "observation": observations["observation"],
-            "action": actions,
-            "next_observation": next_observations["observation"],
-            "next_achieved_goal": next_observations["achieved_goal"],
-            "desired_goal": observations["desired_goal"],
-            "collision": collisions,
-        }
         for i, episode in enumerate(self.running):
-            episode.append({name: array[i] for name, array in step.items()})
+            before = {name: array[i] for name, array in observations.items()}
+            after = {name: array[i] for name, array in next_observations.items()}
+            episode.append(episodes.transition(before, actions[i], after, collisions[i]))
             if ended[i]:
                 self.add_episode(episode)
                 self.running[i] = []
@@ -294,30 +247,19 @@ class HerReplayBuffer:
         self.running = [[] for _ in self.running]
 
     def add_episode(self, transitions):
-        """`transitions`: a list of dicts with the float arrays' names as keys."""
+        """`transitions`: a list, each as `roboarm_nmp.datasets.episodes.transition` makes them."""
+        if not transitions:
+            return
         index = (self.position + np.arange(len(transitions))) % self.capacity
-        for name in transitions[0] if transitions else ():
-            width = self.arrays[name].shape[1]  # an observation's is without the latent
-            values = np.stack([np.atleast_1d(transition[name]) for transition in transitions])
-            self.arrays[name][index] = values[:, :width]
-            if name.endswith("observation"):
-                latents = values[:, width:].astype(np.float32)
-                numbers = [self.latent_number(latent) for latent in latents]
-                self.arrays[name.replace("observation", "latent")][index] = numbers
         self.arrays["remaining"][index] = np.arange(len(transitions))[::-1]
+        for name in self.arrays.keys() - {"remaining"}:
+            self.arrays[name][index] = [transition[name] for transition in transitions]
         self.position = (self.position + len(transitions)) % self.capacity
         self.size = min(self.size + len(transitions), self.capacity)
 
-    def latent_number(self, latent):
-        """The row of a latent (z,) in `latents`, where a new one is added."""
-        number = self.latent_numbers.setdefault(latent.tobytes(), len(self.latent_numbers))
-        if number == len(self.latents):
-            self.latents = np.concatenate([self.latents, np.zeros_like(self.latents)])
-        self.latents[number] = latent
-        return number
-
+    # SHARED: hindsight
     def sample(self, batch_size):
-        """A dict of float32 arrays (batch_size, ...); `reward` and `terminated` (batch_size,)."""
+        """A dict of arrays (batch_size, ...), `reward` and `terminated` (batch_size,) with them."""
         index = self.rng.integers(self.size, size=batch_size)
         data = {name: array[index] for name, array in self.arrays.items()}
         later = self.rng.random(batch_size) ** self.args.her_exponent * (data.pop("remaining") + 1)
@@ -326,14 +268,12 @@ class HerReplayBuffer:
         hindsight_goal = self.arrays["next_achieved_goal"][later]
         data["desired_goal"] = np.where(relabel[:, None], hindsight_goal, data["desired_goal"])
         achieved, desired = data["next_achieved_goal"], data["desired_goal"]
-        info = {"collision": data["collision"][:, 0] > 0}
+        info = {"collision": data["collision"]}
         data["reward"] = self.compute_reward(achieved, desired, info).astype(np.float32)
         data["terminated"] = self.compute_terminated(achieved, desired, info).astype(np.float32)
-        for name in ("", "next_"):
-            latent = self.latents[data.pop(f"{name}latent")]
-            data[f"{name}observation"] = np.hstack([data[f"{name}observation"], latent])
         return data
 
+    # SHARED: batches, state of the buffer
     def batches(self, number, batch_size, device):
         """Yield `number` batches, dicts of tensors; up to 64 are sampled together, for speed."""
         for first in range(0, number, 64):
@@ -344,22 +284,13 @@ class HerReplayBuffer:
 
     def state_dict(self):
         arrays = {name: torch.from_numpy(a[: self.size]) for name, a in self.arrays.items()}
-        latents = torch.from_numpy(self.latents[: len(self.latent_numbers)])
-        return {"arrays": arrays, "latents": latents, "position": self.position}
+        return {"arrays": arrays, "position": self.position}
 
     def load_state_dict(self, state):
         self.size = len(state["arrays"]["remaining"])
         self.position = state["position"]
         for name, array in state["arrays"].items():
             self.arrays[name][: self.size] = array.numpy()
-        for latent in state["latents"].numpy():
-            self.latent_number(latent)
-
-
-# END SHARED
-
-
-RULES = ("horizon", "stop_on_collision", "contact_cost")  # flags that are arguments of `make`
 
 
 # SHARED: environments
@@ -374,14 +305,7 @@ def make_env(args, demos=None) -> Any:
     rules = {name: getattr(args, name) for name in RULES}
     rules["goal_link_distances"] = False  # relabelled goals would not have them
     env = roboarm_nmp.make(args.task, **env_arguments(args), **rules)
-    return env if demos is None else DemoQueriesWrapper(env, demos)
-
-
-def updates_due(step, args):
-    """Number of updates in the last `num_envs` steps; the first `learning_starts` have none."""
-    begin = max(0, step - args.num_envs - args.learning_starts)
-    end = max(0, step - args.learning_starts)
-    return int(end * args.updates_per_step) - int(begin * args.updates_per_step)
+    return env if demos is None else episodes.DemoQueriesWrapper(env, demos)
 
 
 def reset_seeds(args, step):
@@ -404,9 +328,6 @@ def discount_factor(gamma, robot):
     return 0.98 if (robot.upper - robot.lower).max() >= WHOLE_TURN else 0.95
 
 
-# END SHARED
-
-
 # ALGO LOGIC: networks, optimisers and updates
 LOG_SECONDS = 10  # between two logs of the losses
 DEMO_BATCH_SIZE = 128  # transitions of demonstrations in every batch, with --bc-weight
@@ -414,8 +335,9 @@ POLICY_FREQUENCY = 2  # updates of the critics per update of the policy and of a
 POLICY_NOISE, NOISE_CLIP = 0.2, 0.5  # of the critics' target, in units of the action scale
 
 
-class TD3:
+class TD3(nn.Module):
     def __init__(self, args, env, device):
+        super().__init__()
         self.args = args
         self.gamma = discount_factor(args.gamma, env.unwrapped.robot)
         self.actor = Actor(args, env).to(device)
@@ -423,20 +345,11 @@ class TD3:
         self.actor_target.load_state_dict(self.actor.state_dict())
         self.actor_average = Actor(args, env).to(device).eval()  # evaluated and saved
         self.actor_average.load_state_dict(self.actor.state_dict())
-        self.critics = Critics(args, self.actor.features).to(device)
-        self.critics_target = Critics(args, self.actor.features).to(device)
+        self.critics = Critics(args, self.actor).to(device)
+        self.critics_target = Critics(args, self.actor).to(device)
         self.critics_target.load_state_dict(self.critics.state_dict())
         self.actor_optimizer = adam(self.actor.parameters(), args.learning_rate, device)
-        self.q_optimizer = adam(self.critics.parameters(), args.learning_rate, device)
-        self.state = {
-            "actor": self.actor,
-            "actor_target": self.actor_target,
-            "actor_average": self.actor_average,
-            "critics": self.critics,
-            "critics_target": self.critics_target,
-            "actor_optimizer": self.actor_optimizer,
-            "q_optimizer": self.q_optimizer,
-        }
+        self.critic_optimizer = adam(self.critics.parameters(), args.learning_rate, device)
 
     @torch.no_grad()
     def explore(self, data):
@@ -463,9 +376,9 @@ class TD3:
             next_q_value = data["reward"] + self.gamma * (1.0 - data["terminated"]) * next_value
         qf_values = self.critics(features, data["action"])
         qf_losses = (qf_values - next_q_value).square().mean(1)  # of Q1 and of Q2
-        self.q_optimizer.zero_grad()
+        self.critic_optimizer.zero_grad()
         qf_losses.sum().backward()
-        self.q_optimizer.step()
+        self.critic_optimizer.step()
         return {"qf1_values": qf_values[0], "qf_loss": qf_losses}
 
     def update_actor(self, data):
@@ -496,17 +409,16 @@ if __name__ == "__main__":
     args: Any = parse_args(Args, may_change={"total_timesteps", "test_queries", "stop_at_success"})
     device = seed_torch(args)
     validation, test = load_task(args)
-    uses_demos = args.demo_prob is not None
-    if not uses_demos and (args.demos or args.bc_weight > 0):
-        fail("--demos and --bc-weight go with --demo-prob")
     with errors_of("--encoder, --geometry-source, --link-distances"):
         env = make_env(args)  # for its spaces and rewards
     demos: Any = None
-    if uses_demos:
+    if args.demo_prob is not None:
         with errors_of("--demo-prob"):
-            demos = load_demos_for(env, args.demos, args.task)
-    # END SHARED
+            demos = episodes.load_demos_for(env, args.demos, args.task)
+    elif args.demos or args.bc_weight > 0:
+        fail("--demos and --bc-weight go with --demo-prob")
 
+    # ALGO LOGIC: the agent
     agent = TD3(args, env, device)
     # SHARED: run, buffers, episodes
     explore = graphed(agent.explore, device)
@@ -515,7 +427,9 @@ if __name__ == "__main__":
     rng = np.random.default_rng(args.seed)
     buffer = HerReplayBuffer(env, BUFFER_SIZE, args, rng)
     progress = {"updates": 0, "demos_injected": 0, "evaluated": 0, "best": -1.0, "best_step": 0}
-    state = agent.state | {"buffer": buffer, "rng": rng, "progress": progress}
+    state = {"agent": agent, "buffer": buffer, "rng": rng, "progress": progress}
+    state["actor_optimizer"] = agent.actor_optimizer
+    state["critic_optimizer"] = agent.critic_optimizer
     run = Run(args, task_name(args.task), state)
     makers = [functools.partial(make_env, args, demos)] * args.num_envs
     if device.type == "cuda":  # it would wait for the environments; a CPU computes longer than they
@@ -526,14 +440,12 @@ if __name__ == "__main__":
     if args.bc_weight > 0:
         demo_buffer = HerReplayBuffer(env, int(demos.offsets[-1]), args, rng)
         for demo in progress_bar(demos, "demonstrations", transient=True):
-            demo_buffer.add_episode(demo_transitions(demo, env))
-    observations, infos = envs.reset(seed=reset_seeds(args, run.step))
-    demo_numbers: Any = infos.get("demo")
+            demo_buffer.add_episode(episodes.demo_transitions(demo, env))
+    observations, _ = envs.reset(seed=reset_seeds(args, run.step))
     returns, contacts = np.zeros(args.num_envs), np.zeros(args.num_envs)
     losses = {}
     logged = 0.0
     run.start(args.total_timesteps, "step")
-    # END SHARED
 
     while True:
         # SHARED: evaluate, keep the best policy
@@ -555,13 +467,11 @@ if __name__ == "__main__":
             if result["success_rate"] >= progress["best"]:
                 progress |= {"best": result["success_rate"], "best_step": run.step}
                 os.replace(latest, run.folder / "policy.onnx")
-            observations, infos = envs.reset(seed=reset_seeds(args, run.step))
-            demo_numbers = infos.get("demo")
+            observations, _ = envs.reset(seed=reset_seeds(args, run.step))
             returns[:] = contacts[:] = 0.0
         reached = args.stop_at_success is not None and progress["best"] >= args.stop_at_success
         if run.step >= args.total_timesteps or reached:
             break
-        # END SHARED
 
         # ALGO LOGIC: act
         if run.step < args.learning_starts:
@@ -588,21 +498,20 @@ if __name__ == "__main__":
         contacts += collisions
         for i in np.flatnonzero(ended):
             success = infos["final_info"]["is_success"][i]
-            if uses_demos and not success and rng.random() < args.demo_prob:
-                buffer.add_episode(demo_transitions(demos[int(demo_numbers[i])], env))
+            if demos is not None and not success and rng.random() < args.demo_prob:
+                demo = demos[int(infos["final_info"]["demo"][i])]
+                buffer.add_episode(episodes.demo_transitions(demo, env))
                 progress["demos_injected"] += 1
             steps = infos["final_info"]["elapsed_steps"][i]
             episode = {"episodic_return": returns[i], "episodic_length": steps, "success": success}
             episode["contact_share"] = contacts[i] / steps
             run.log({f"charts/{name}": value for name, value in episode.items()})
             returns[i] = contacts[i] = 0.0
-        if uses_demos and ended.any():
-            demo_numbers = np.where(ended, infos["demo"], demo_numbers)
         observations = next_observations
-        # END SHARED
 
         # SHARED: learn
-        number = updates_due(run.step, args) if buffer.size > 0 else 0
+        updates_due = int(max(0, run.step - args.learning_starts) * args.updates_per_step)
+        number = updates_due - progress["updates"] if buffer.size > 0 else 0
         batches = buffer.batches(number, args.batch_size, device)
         if demo_buffer is not None:
             more = demo_buffer.batches(number, DEMO_BATCH_SIZE, device)
@@ -622,4 +531,3 @@ if __name__ == "__main__":
     envs.close()
     run.save()  # a longer run, which continues this one, knows its best policy
     finish(run, test, progress["best"], progress["best_step"])
-    # END SHARED

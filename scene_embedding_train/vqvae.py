@@ -7,8 +7,8 @@ A vector-quantised autoencoder (van den Oord et al., 2017) as in the paper's app
 verifying the encoders": each camera has an encoder to 16 dimensions, which consist of vectors from
 a codebook, and a decoder that receives these 16. What is saved, `encoder.onnx`, is a
 network from the images to z_E, the cameras' latent codes side by side. To make an encoder of your
-own, copy this file and change the parts under `# MODEL`. Parts between `# SHARED` and
-`# END SHARED` are those of `vae.py`.
+own, copy this file and change the parts under `# MODEL`. Parts under `# SHARED` are
+those of `vae.py`.
 """
 
 import math
@@ -88,9 +88,6 @@ def convolutions(size, width):
     return nn.Sequential(*layers, nn.Flatten()), channels[-1] * (size // 2**halvings) ** 2
 
 
-# END SHARED
-
-
 # SHARED: a decoder of images
 class Decoder(nn.Module):
     """A latent (n, inputs) -> one camera's images (n, 3, size, size) in [0, 1]."""
@@ -109,9 +106,6 @@ class Decoder(nn.Module):
     def forward(self, latent):
         features = self.head(latent).unflatten(1, (-1, self.smallest, self.smallest))
         return torch.sigmoid(self.convolutions(features))
-
-
-# END SHARED
 
 
 # MODEL
@@ -249,7 +243,6 @@ if __name__ == "__main__":
     device = seed_torch(args)
     rng = np.random.default_rng(args.seed)
     mean_image = mean_of_images(images, num_training, device)
-    # END SHARED
 
     # MODEL: network and optimiser
     model = VQVAE(len(cameras), size, args).to(device)
@@ -296,4 +289,3 @@ if __name__ == "__main__":
     summary = "error {error:.5f} (mean image {mean_image_error:.5f}); foreground "
     summary += "{error_foreground:.4f} ({mean_image_error_foreground:.4f})"
     print(f"{summary.format(**result)}. {run.folder / 'result.json'}")
-    # END SHARED

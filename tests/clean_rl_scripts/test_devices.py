@@ -22,6 +22,11 @@ def flags(trainer):
     return [*few, "--eval-queries", "1", "--test-queries", "1"]
 
 
+def devices(state):
+    """Of the weights in a checkpoint."""
+    return {tensor.device.type for tensor in state.get("agent", state.get("actor")).values()}
+
+
 def num_updates(state):
     """Of a checkpoint."""
     return state["progress"].get("updates", state["counts"]["step"])
@@ -38,14 +43,14 @@ def test_update_evaluation_and_resume_on_another_device(
     (run,) = tmp_path.iterdir()
     state = torch.load(run / "checkpoint.pt", weights_only=True)
     assert num_updates(state) > 0
-    assert {tensor.device.type for tensor in state["actor"].values()} == {another_device}
+    assert devices(state) == {another_device}
     (run / "result.json").unlink()
     longer, steps = ("--total-updates", 4) if trainer == "bc" else ("--total-timesteps", 120)
     run_here(PATHS[trainer], "--resume", run, longer, steps)
     assert json.loads((run / "result.json").read_text())["steps"] == steps
     resumed = torch.load(run / "checkpoint.pt", weights_only=True)
     assert num_updates(resumed) > num_updates(state)
-    assert {tensor.device.type for tensor in resumed["actor"].values()} == {another_device}
+    assert devices(resumed) == {another_device}
 
 
 @pytest.mark.parametrize("trainer", TRAINERS)

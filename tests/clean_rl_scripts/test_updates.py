@@ -45,7 +45,7 @@ def take_apart(agent, *names):
 
 def state(agent):
     """All that an update may change, copied."""
-    return copy.deepcopy({k: v for k, v in agent.state.items() if "optimizer" not in k})
+    return copy.deepcopy({**agent._modules, **agent._parameters})
 
 
 def update(agent, data):

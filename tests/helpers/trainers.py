@@ -4,6 +4,7 @@ import contextlib
 import functools
 import importlib.util
 import io
+import re
 import runpy
 import signal
 import subprocess
@@ -58,20 +59,11 @@ def load(trainer):
 
 
 def shared_blocks(path):
-    """Name -> lines of a script's blocks from `# SHARED: name` to `# END SHARED`."""
-    blocks, name = {}, None
-    for line in path.read_text().splitlines():
-        if line.strip().startswith("# SHARED: "):
-            assert name is None, f"{line} inside {name}"
-            name = line.strip().removeprefix("# SHARED: ")
-            assert name not in blocks
-            blocks[name] = []
-        elif line.strip() == "# END SHARED":
-            assert name is not None
-            name = None
-        elif name is not None:
-            blocks[name].append(line)
-    assert name is None
+    """Name -> text of a script's parts, each from `# SHARED: name` to the next such comment."""
+    parts = re.split(r"^ *# (?=SHARED|ALGO LOGIC|MODEL)|^if __name", path.read_text(), flags=re.M)
+    shared = [part.partition("\n") for part in parts if part.startswith("SHARED: ")]
+    blocks = {name: text.rstrip() for name, _, text in shared}
+    assert len(blocks) == len(shared)
     return blocks
 
 

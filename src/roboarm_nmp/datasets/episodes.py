@@ -130,8 +130,8 @@ def demo_transitions(demo: Demo, env: "RoboArmEnv") -> list[dict[str, Any]]:
 class DemoQueriesWrapper(gym.Wrapper):
     """Episodes on the queries of demonstrations: `reset` draws one of them.
 
-    Its number in `demos` is in `info["demo"]`. If the environment has an encoder, all scenes are
-    encoded first, which may take minutes.
+    Its number in `demos` is in `info["demo"]`, also after each step. If the environment has an
+    encoder, all scenes are encoded first, which may take minutes.
 
     Args:
         env: an environment of `envs.make`.
@@ -156,10 +156,17 @@ class DemoQueriesWrapper(gym.Wrapper):
         """As `RoboArmEnv.reset`."""
         if seed is not None:
             self.env.reset(seed=seed)
-        number = int(self.np_random.integers(len(self.demos)))
-        demo = self.demos[number]
+        self.number = int(self.np_random.integers(len(self.demos)))
+        demo = self.demos[self.number]
         observation, info = self.env.reset_specific(demo.start, demo.goal, demo.scene)
-        return observation, info | {"demo": number}
+        return observation, info | {"demo": self.number}
+
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """As `RoboArmEnv.step`."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated, info | {"demo": self.number}
 
 
 def load_demos_for(env: "RoboArmEnv", files: Sequence[str | Path], task: str) -> Demos:

@@ -1,4 +1,4 @@
-"""Parts of policies' networks: a layer, and inputs that ease learning: kinematics, differences."""
+"""Parts of policies' networks: averages, a layer, and inputs that ease learning."""
 
 from typing import Any
 
@@ -17,6 +17,14 @@ from roboarm_nmp.envs.robots.robot import Robot
 ALONG = np.diag([1.0, 1.0, 0.0])
 FIXED = np.diag([0.0, 0.0, 1.0])
 ACROSS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+
+
+def polyak_update(target: nn.Module, network: nn.Module, tau: float) -> None:
+    """target <- (1 - tau) target + tau network, all parameters at once."""
+    with torch.no_grad():
+        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage]
+            list(target.parameters()), list(network.parameters()), tau
+        )
 
 
 class Bf16Linear(nn.Linear):

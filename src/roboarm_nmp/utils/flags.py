@@ -37,7 +37,7 @@ GROUPS = {
     "task": (
         *("task", "robot", "start", "goal", "goal_pose", "goal_type", "split", "queries"),
         *("problems", "num_queries", "query", "num"),
-        *("action_mode", "max_step", "horizon", "stop_on_collision", "contact_cost"),
+        *("max_step", "horizon", "stop_on_collision", "contact_cost"),
     ),
     "observation": (
         *("encoder", "num_points", "velocities", "geometry_source", "link_distances"),
