@@ -30,10 +30,11 @@ from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.evaluation.evaluate import evaluate, first_episode_images
 from roboarm_nmp.policies.export import save_policy
 from roboarm_nmp.training.arguments import errors_of, fail, parse_args
-from roboarm_nmp.training.cuda_graphs import adam, graphed, set_learning_rate, to_device
+from roboarm_nmp.training.cuda_graphs import graphed
+from roboarm_nmp.training.devices import adam, seed_torch, set_learning_rate, to_device
 from roboarm_nmp.training.final_test import RESULTS, finish, load_task
 from roboarm_nmp.training.network_parts import Bf16Linear, GoalFeatures, polyak_update
-from roboarm_nmp.training.runs import Run, script_name, seed_torch
+from roboarm_nmp.training.runs import Run, script_name
 from roboarm_nmp.utils import flags
 
 

@@ -37,10 +37,11 @@ from roboarm_nmp.policies.export import save_policy
 from roboarm_nmp.policies.registry import policy_file
 from roboarm_nmp.policies.safety_filter import SafetyFilter
 from roboarm_nmp.training.arguments import errors_of, fail, parse_args
-from roboarm_nmp.training.cuda_graphs import adam, graphed, set_learning_rate, to_device
+from roboarm_nmp.training.cuda_graphs import graphed
+from roboarm_nmp.training.devices import adam, seed_torch, set_learning_rate, to_device
 from roboarm_nmp.training.final_test import RESULTS, finish, load_task
 from roboarm_nmp.training.network_parts import Bf16Linear, polyak_update, pose_difference
-from roboarm_nmp.training.runs import Run, script_name, seed_torch
+from roboarm_nmp.training.runs import Run, script_name
 from roboarm_nmp.utils import flags, workers
 from roboarm_nmp.utils.progress import progress_bar
 

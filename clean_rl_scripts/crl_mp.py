@@ -30,10 +30,12 @@ from roboarm_nmp.envs.tasks import task_name
 from roboarm_nmp.evaluation.evaluate import evaluate, first_episode_images
 from roboarm_nmp.policies.export import save_policy
 from roboarm_nmp.training.arguments import errors_of, fail, parse_args
-from roboarm_nmp.training.cuda_graphs import adam, graphed, to_device
+from roboarm_nmp.training.cuda_graphs import graphed
+from roboarm_nmp.training.devices import adam, seed_torch, to_device
+from roboarm_nmp.training.errors import check_finite
 from roboarm_nmp.training.final_test import RESULTS, finish, load_task
 from roboarm_nmp.training.network_parts import Bf16Linear, GoalFeatures, polyak_update
-from roboarm_nmp.training.runs import Run, check_finite, script_name, seed_torch
+from roboarm_nmp.training.runs import Run, script_name
 from roboarm_nmp.training.vector_envs import async_envs
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.progress import progress_bar
@@ -565,7 +567,7 @@ if __name__ == "__main__":
         contacts += collisions
         for i in np.flatnonzero(ended):
             success = infos["final_info"]["is_success"][i]
-            if demos is not None and not success and rng.random() < args.demo_prob:
+            if args.demo_prob is not None and not success and rng.random() < args.demo_prob:
                 demo = demos[int(infos["final_info"]["demo"][i])]
                 buffer.add_episode(episodes.demo_transitions(demo, env))
                 progress["demos_injected"] += 1

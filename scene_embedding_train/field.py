@@ -50,7 +50,9 @@ from roboarm_nmp.scene_embedding_train.training_data import (
     write_result,
 )
 from roboarm_nmp.training.arguments import fail, parse_args
-from roboarm_nmp.training.runs import Run, check_finite, seed_torch
+from roboarm_nmp.training.devices import seed_torch
+from roboarm_nmp.training.errors import check_finite
+from roboarm_nmp.training.runs import Run
 from roboarm_nmp.utils.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Width
 
 # The field is around the robot's axis, m.

@@ -43,7 +43,9 @@ from roboarm_nmp.scene_embedding_train.clouds import (
     thin_out,
 )
 from roboarm_nmp.training.arguments import fail, parse_args
-from roboarm_nmp.training.runs import Run, check_finite, seed_torch
+from roboarm_nmp.training.devices import seed_torch
+from roboarm_nmp.training.errors import check_finite
+from roboarm_nmp.training.runs import Run
 from roboarm_nmp.utils.flags import PositiveFloat, PositiveInt, Width
 
 

@@ -37,7 +37,8 @@ from roboarm_nmp.scene_embedding_train.training_data import (
     write_result,
 )
 from roboarm_nmp.training.arguments import fail, parse_args
-from roboarm_nmp.training.runs import Run, seed_torch
+from roboarm_nmp.training.devices import seed_torch
+from roboarm_nmp.training.runs import Run
 from roboarm_nmp.utils.flags import NonNegativeFloat, PositiveFloat, PositiveInt, Width
 
 

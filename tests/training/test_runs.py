@@ -17,6 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from roboarm_nmp.training import runs
 from roboarm_nmp.training.arguments import parse_args
+from roboarm_nmp.training.devices import seed_torch
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.files import new_contents
 
@@ -163,7 +164,7 @@ def test_run_continues_with_every_part_its_step_and_its_time(parse, tmp_path):
     run, before = begin(parse, tmp_path)
     run.start(10, "update")
     assert run.step == 0 and not run.interrupted
-    runs.seed_torch(run.args)
+    seed_torch(run.args)
     learn(before)
     run.advance(3)
     run.advance()
@@ -333,7 +334,7 @@ def test_events_of_repeated_steps_are_hidden(parse, tmp_path):
     folder = folder_of(parse("--runs-dir", tmp_path))
     for first, end in ((0, 4), (2, 5)):  # stopped after step 4, its checkpoint was of step 2
         run = runs.Run(parse("--resume", folder), "wall", {})
-        run._counts["step"] = first
+        run.step = first
         run.start(5, "step")
         while run.step < end:
             run.advance()

@@ -23,8 +23,9 @@ if __name__ == "__main__":
     exec(sys.argv[1])
 """
 KILL_ONE = """
-from roboarm_nmp.training import runs
-sys.excepthook = lambda *error: runs._say_plainly(runs.Path("a"), *error)
+from pathlib import Path
+from roboarm_nmp.training.errors import say_plainly
+sys.excepthook = functools.partial(say_plainly, Path("a"))
 envs.processes[0].kill()
 for _ in range(2):
     envs.step(np.zeros(2, int))

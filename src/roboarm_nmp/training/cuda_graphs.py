@@ -7,29 +7,11 @@ it has no `.item()`, and nothing on the CPU depends on its results. On a CPU not
 """
 
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
-import numpy as np
 import torch
 
 WARM_UP = 3  # ordinary calls before a capture, in which libraries and optimisers allocate
-
-
-def adam(parameters: Iterable, rate: float, device: torch.device) -> torch.optim.Adam:
-    """Fused Adam; on a GPU, one whose step and learning rate may be part of a graph."""
-    if device.type != "cuda":
-        return torch.optim.Adam(parameters, lr=rate, fused=True)
-    tensor = torch.tensor(rate, device=device)  # a graph would repeat a number
-    return torch.optim.Adam(parameters, lr=tensor, fused=True, capturable=True)
-
-
-def set_learning_rate(optimizer: torch.optim.Optimizer, value: float) -> None:
-    """Change the learning rate, also of the graphs that have the optimiser's steps in them."""
-    for group in optimizer.param_groups:
-        if isinstance(group["lr"], torch.Tensor):
-            group["lr"].fill_(value)
-        else:
-            group["lr"] = value
 
 
 def graphed(function: Callable[[dict], dict], device: torch.device) -> Callable[[dict], dict]:
@@ -64,11 +46,3 @@ def graphed(function: Callable[[dict], dict], device: torch.device) -> Callable[
         return outputs
 
     return call
-
-
-def to_device(array: np.ndarray, device: torch.device) -> torch.Tensor:
-    """A NumPy array as a tensor on the device; on a GPU without waiting for the copy."""
-    tensor = torch.as_tensor(array)
-    if device.type == "cuda":
-        return tensor.pin_memory().to(device, non_blocking=True)
-    return tensor.to(device)

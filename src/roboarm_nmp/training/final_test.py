@@ -61,8 +61,7 @@ def finish(
     result: dict[str, Any] = {"task": run.args.task, "goal_type": run.args.goal_type}
     text = "no test, --test-queries 0"
     if len(test):
-        options = {"queries": test, "workers": num_workers}
-        tested = evaluate(policy, run.args.task, progress=True, **options)
+        tested = evaluate(policy, run.args.task, queries=test, workers=num_workers, progress=True)
         names = (*RESULTS, "num_queries", "robot", "privileged", "deviations")
         result |= {name: tested[name] for name in names}
         text = (

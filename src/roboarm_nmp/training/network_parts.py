@@ -57,12 +57,6 @@ class JacobianTranspose(nn.Module):
         rotates: the vector has an angular part.
     """
 
-    weights: torch.Tensor
-    biases: torch.Tensor
-    middle: torch.Tensor
-    per_state: torch.Tensor
-    is_prismatic: torch.Tensor
-
     def __init__(self, robot: Robot, rotates: bool = False):
         super().__init__()
         self.size = 9 if rotates else 6  # position, vector, angular part
@@ -93,15 +87,11 @@ class JacobianTranspose(nn.Module):
             turn = np.eye(3)
             origin = np.zeros(3)
         per_state = moving[:, SCALE, None] * (moving[:, JOINT, None] == np.arange(robot.num_joints))
-        numbers = {
-            "weights": weights,
-            "biases": biases,
-            "middle": moving[:, MIDDLE],
-            "per_state": per_state,  # of joints' values, those of mimicking joints, too
-        }
-        for name, values in numbers.items():
-            self.register_buffer(name, torch.tensor(np.array(values), dtype=torch.float32))
-        self.register_buffer("is_prismatic", torch.tensor(moving[:, PRISMATIC] > 0))
+        self.weights = nn.Buffer(torch.tensor(np.array(weights)).float())
+        self.biases = nn.Buffer(torch.tensor(np.array(biases)).float())
+        self.middle = nn.Buffer(torch.tensor(moving[:, MIDDLE]).float())
+        self.per_state = nn.Buffer(torch.tensor(per_state).float())  # also of mimicking joints
+        self.is_prismatic = nn.Buffer(torch.tensor(moving[:, PRISMATIC] > 0))
 
     def forward(
         self, state: torch.Tensor, position: torch.Tensor, vector: torch.Tensor
@@ -168,9 +158,6 @@ class GoalFeatures(nn.Module):
         num_joints: n of the arm.
     """
 
-    middle: torch.Tensor
-    half_range: torch.Tensor
-
     def __init__(self, env: RoboArmEnv, plain: bool = False, jacobian: bool = True):
         super().__init__()
         bare = env.unwrapped
@@ -187,8 +174,8 @@ class GoalFeatures(nn.Module):
         if jacobian and not plain and goal_type.has_position:
             self.jacobian = JacobianTranspose(robot, rotates=goal_type.has_rotation)
         low, high = torch.tensor(robot.lower), torch.tensor(robot.upper)
-        self.register_buffer("middle", ((high + low) / 2).float())
-        self.register_buffer("half_range", ((high - low) / 2).float())
+        self.middle = nn.Buffer(((high + low) / 2).float())
+        self.half_range = nn.Buffer(((high - low) / 2).float())
         # The configuration, velocities (or not) and the end effector's position or pose.
         end = bare_space["observation"].shape[0]
         self.ee = slice(end - goal_type.end_effector_size, end)
