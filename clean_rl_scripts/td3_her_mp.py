@@ -512,8 +512,9 @@ if __name__ == "__main__":
         observations = next_observations
 
         # SHARED: learn
-        updates_due = int(max(0, run.step - args.learning_starts) * args.updates_per_step)
-        number = updates_due - progress["updates"] if buffer.size > 0 else 0
+        steps = max(0, run.step - args.learning_starts) if buffer.size > 0 else 0
+        earlier_steps = max(0, steps - args.num_envs)
+        number = int(steps * args.updates_per_step) - int(earlier_steps * args.updates_per_step)
         batches = buffer.batches(number, args.batch_size, device)
         if demo_buffer is not None:
             more = demo_buffer.batches(number, DEMO_BATCH_SIZE, device)
