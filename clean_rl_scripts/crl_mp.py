@@ -93,8 +93,6 @@ class Args(RunArgs, EnvArgs):
     """environment steps with random actions before the first update"""
     horizon: flags.Horizon = 100
     """steps after which an episode of the training is truncated"""
-    stop_on_collision: bool = False
-    """end an episode of the training at the first contact: goals beyond it are never reached"""
     updates_per_step: flags.NonNegativeFloat = 0.1
     """updates of the critic per environment step; with 0.5, success stops rising early"""
     batch_size: flags.PositiveInt = 256
@@ -149,7 +147,7 @@ class Args(RunArgs, EnvArgs):
     """stop at this success rate on validation queries, e.g. 0.9; by default never"""
 
 
-RULES = ("horizon", "stop_on_collision")  # flags that are arguments of `make`
+RULES = ("horizon",)  # flags that are arguments of `make`
 
 
 # SHARED: hidden layers
