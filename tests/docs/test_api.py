@@ -5,6 +5,7 @@ import pytest
 import torch
 from docs_scripts import names_of
 from paths import ROOT
+from trainers import short_evaluations
 
 import roboarm_nmp
 from roboarm_nmp.clean_rl_scripts import evaluate
@@ -19,7 +20,7 @@ PAGE = (ROOT / "docs/reference/api.md").read_text()
 def page(tmp_path_factory):
     """The folder and the names after all snippets were run, in their order."""
     folder = tmp_path_factory.mktemp("page")
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, short_evaluations():
         patch.chdir(folder)
         return folder, names_of("reference/api.md")
 
@@ -33,7 +34,7 @@ def test_snippets_of_the_page_run(page):
     assert len(names["demos"][:10]) == 10
 
 
-def test_stable_baselines3_policy_of_the_page_acts_as_its_model(page, capsys):
+def test_stable_baselines3_policy_of_the_page_acts_as_its_model(page, capsys, short_episodes):
     folder, names = page
     arguments = ["--policy", str(folder / "policy.onnx"), "--task", "wall", "--num-queries", "2"]
     assert evaluate.main([*arguments, "--workers", "1"]) == 0

@@ -41,7 +41,7 @@ def test_code_of_safety_filter_page_runs():
     assert names["act"](names["observation"]).shape == (7,)
 
 
-def test_code_of_evaluation_page_runs():
+def test_code_of_evaluation_page_runs(short_episodes):
     result = names_of("guide/evaluation.md")["result"]
     assert result["safety_filter"]["margin"] == 0.01 and not result["privileged"]
 

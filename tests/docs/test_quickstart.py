@@ -9,7 +9,7 @@ import pytest
 from paths import ROOT
 from PIL import Image
 from tensorboard import program
-from trainers import PATHS, TINIER, run_here
+from trainers import PATHS, TINIER, run_here, short_evaluations
 
 from roboarm_nmp import __main__
 
@@ -46,7 +46,8 @@ def test_page_works_from_top_to_bottom(tmp_path, monkeypatch, capsys):
         for line in text.splitlines() if not kind else ():
             if line != "roboarm demo":  # it stays open; tests/envs/viewer has its tests
                 capsys.readouterr()
-                run(line)
+                with short_evaluations(120):
+                    run(line)
                 printed[line] = capsys.readouterr().out
     assert names["execution"].reached and not names["execution"].collided
     assert names["observation"]["desired_goal"].shape == (3,)
