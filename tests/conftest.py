@@ -1,6 +1,7 @@
 import contextlib
 import functools
 import gc
+import hashlib
 import importlib.util
 import os
 import random
@@ -17,6 +18,7 @@ from trainers import GPU, short_evaluations
 from roboarm_nmp.datasets.demonstrations import load_demos, write_demos
 from roboarm_nmp.networks import export
 from roboarm_nmp.utils import workers
+from roboarm_nmp.utils.files import write_atomically
 
 # As many threads as a trainer has in a process of its own, whatever benchmarks set when they are
 # imported: results are compared bit for bit.
@@ -105,9 +107,6 @@ def structure_of(module):
     return repr(parts)
 
 
-EXPORTED = {}
-
-
 @functools.cache
 def tabulate_operators_once():
     """PyTorch fills the same table of ONNX operators anew for every export, in a second."""
@@ -118,21 +117,27 @@ def tabulate_operators_once():
 
 
 @pytest.fixture(scope="module", autouse=True)
-def exports_once():
+def exports_once(tmp_path_factory):
     """PyTorch takes seconds to export a network, so those that differ in weights alone share one.
 
-    `save_network` compares each with its module. test_networks.py exports all of its own.
+    They are in a folder that the processes of a run share. `save_network` compares each with its
+    module. test_networks.py exports all of its own.
     """
-    export_module = export._export
+    export_module, folder = export._export, tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    folder = folder / "exported"
+    folder.mkdir(exist_ok=True)
 
     def export_once(module, inputs, *options):
         shapes = [(name, tuple(one.shape), one.dtype) for name, one in inputs.items()]
         structure = repr((structure_of(module), shapes, *options))
-        if structure not in EXPORTED:
+        path = folder / hashlib.sha256(structure.encode()).hexdigest()
+        if not path.exists():
             tabulate_operators_once()
-            EXPORTED[structure] = export_module(module, inputs, *options)
-        model, weights = onnx.ModelProto(), dict(module.named_parameters())
-        model.CopyFrom(EXPORTED[structure])
+            model = export_module(module, inputs, *options)
+            write_atomically(path, model.SerializeToString())
+        model, weights = onnx.load(path), dict(module.named_parameters())
         for tensor in model.graph.initializer:
             if tensor.name in weights:
                 array = weights[tensor.name].numpy()

@@ -12,7 +12,7 @@ import pytest
 import torch
 from paths import ROOT
 from PIL import Image
-from trainers import outcome_of, roboarm, run_here
+from trainers import outcome_of, roboarm, run_here, short_evaluations
 
 from roboarm_nmp.datasets.demonstrations import load_demos
 from roboarm_nmp.datasets.queries import load_queries
@@ -71,7 +71,7 @@ def error_of(command):
 def page(tmp_path_factory):
     """The folder after the page was followed, and the results of its commands."""
     folder, results, names = tmp_path_factory.mktemp("page"), {}, {}
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, short_evaluations(120):
         patch.chdir(folder)
         patch.setattr("roboarm_nmp.viewer.images.MAX_FRAMES", 4)
         for kind, text in BLOCKS:

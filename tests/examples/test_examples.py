@@ -55,7 +55,7 @@ def test_example_prints_what_it_did(run, example, arguments, printed):
     assert re.search(printed, run(example, *arguments.split()))
 
 
-def test_notebook_trains_and_shows_a_policy(tmp_path, monkeypatch, capsys):
+def test_notebook_trains_and_shows_a_policy(tmp_path, monkeypatch, capsys, short_episodes):
     monkeypatch.chdir(tmp_path)
     names = {}
     for cell in json.loads((ROOT / "examples" / "first_policy.ipynb").read_text())["cells"]:

@@ -1,13 +1,17 @@
 """The trainers of scene encoders as modules and as commands, for the tests."""
 
+import contextlib
 import importlib.util
 import sys
+from unittest.mock import patch
 
 import torch
 from paths import ROOT
 
 from roboarm_nmp.envs.perception.encoders import MAX_OBSTACLES, make_encoder
+from roboarm_nmp.envs.perception.sensors import cardinal
 from roboarm_nmp.envs.scenes.primitives import Box, Cylinder, Scene, Sphere
+from roboarm_nmp.scene_embedding_train import collect
 
 FOLDER = ROOT / "scene_embedding_train"
 SCRIPTS = ("vae", "vqvae", "pointnet2", "field")
@@ -21,6 +25,17 @@ OBSTACLES = (
     Cylinder((-0.3, 0.2, 0.6), 0.1, 0.3, (0.1, -0.7, 0.1, 0.7)),
     Sphere((0.0, -0.4, 0.3), 0.12),
 )
+
+
+@contextlib.contextmanager
+def two_sensors():
+    """A context in which observations are of two sensors: fewer networks to export."""
+
+    def two(*args, **options):
+        return dict(list(cardinal(*args, **options).items())[:2])
+
+    with patch.object(collect, "cardinal", two):
+        yield
 
 
 def obstacle_rows():

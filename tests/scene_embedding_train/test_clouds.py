@@ -12,7 +12,7 @@ from roboarm_nmp.scene_embedding_train import clouds
 def test_loaded_clouds_are_thinned_stored_ones(observations):
     read = Observations(observations)
     sensors, points, labels, depths = clouds.load_clouds(read, 64)
-    assert points.shape == (20, 4, 2, 64, 3) and labels.shape == (20, 4, 2, 64)
+    assert points.shape == (20, 2, 2, 64, 3) and labels.shape == (20, 2, 2, 64)
     for i, name in enumerate(sensors):
         cloud, classes = (one[3].numpy() for one in clouds.whole_clouds(read, 1, name))
         hit = classes != NOTHING

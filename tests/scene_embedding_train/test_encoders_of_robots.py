@@ -1,7 +1,7 @@
 """Observations and encoders of another arm than the Panda: xArm6."""
 
 import pytest
-from encoder_trainers import command
+from encoder_trainers import command, two_sensors
 from paths import ROOT
 from trainers import error_here, run_here
 
@@ -20,9 +20,9 @@ XARM6 = ROOT / "examples" / "robots" / "xarm6.yaml"
 def observations(tmp_path_factory):
     folder = tmp_path_factory.mktemp("observations")
     options = {"num": 12, "sensors": "clouds", "num_samples": 400, "workers": 1}
-    made = collect.collect(
-        collect.Args(f"random_boxes_hard@{XARM6}", output=folder, **options), progress=False
-    )
+    args = collect.Args(f"random_boxes_hard@{XARM6}", output=folder, **options)
+    with two_sensors():
+        made = collect.collect(args, progress=False)
     sensors = cardinal(PointCloud, load_robot(XARM6), num_samples=400)
     assert made.sensors["front_cloud"] == sensors["front"]
     return folder
@@ -38,12 +38,12 @@ def test_observations_are_of_their_arm(observations):
 
 
 def test_encoder_is_for_its_arm(observations, tmp_path, capsys):
-    words = command("field", observations, tmp_path, "--latent-size", "8")[1:]
+    words = command("field", observations, tmp_path)[1:]
     assert "made for the robot 'xarm6' " in error_here(capsys, *words)
     run_here(*words, "--robot", XARM6)
     encoder = next(tmp_path.glob("*/encoder.onnx"))
     assert load_network(encoder).metadata["robot"] == ["xarm6", load_robot(XARM6).fingerprint]
     env = envs.make(f"random_boxes_hard@{XARM6}", encoder=encoder)
-    assert env.reset(seed=0)[0]["observation"].shape == (6 + 3 + 8,)
+    assert env.reset(seed=0)[0]["observation"].shape == (6 + 3 + 64,)
     with pytest.raises(ValueError, match="trained for the robot 'xarm6' .*, not for 'panda'"):
         envs.make("random_boxes_hard", encoder=encoder)
