@@ -181,7 +181,7 @@ class Actor(nn.Module):
     def __init__(self, args, env):
         super().__init__()
         self.features = GoalFeatures(env, args.plain_networks, args.jacobian)
-        self.action_scale = 1.0 if args.plain_networks else 2.0 * MAX_STEP  # of the longest action
+        self.action_scale = 1.0 if args.plain_networks else 2.0 * MAX_STEP  # largest action
         self.mlp = mlp(self.features.size, self.features.num_joints, args)
 
     def get_action(self, features):
