@@ -78,11 +78,11 @@ class Args(RunArgs):
     """learning rate (Adam) at the start; it decreases to zero (Chi et al.: 1e-4)"""
     chunk_size: flags.Width = 16
     """actions in a chunk"""
-    executed_actions: flags.Width = 8
+    executed_actions: flags.Width = 2
     """actions of a chunk that are executed before the next one is drawn"""
     denoising_steps: flags.Layers = 5
     """steps from noise to a chunk, when the policy acts (Chi et al.: 10 to 100)"""
-    noise_scale: flags.NonNegativeFloat = 1.0
+    noise_scale: flags.NonNegativeFloat = 0.0
     """of the noise that the saved policy's chunks are made of; below 1, chunks are nearer to the
     demonstrations' mean"""
     hindsight: flags.Share = 0.5
