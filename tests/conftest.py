@@ -44,9 +44,10 @@ if importlib.util.find_spec("ompl") is None:
 # the collision checks. The other process begins with files that need none of them.
 LONG = (
     *("test_may_touch", "test_encoder_trainers", "test_collision", "test_learning", "test_bc"),
-    *("test_networks", "test_trainers", "test_roadmap_bc", "test_flow", "test_collect"),
-    *("test_evaluation", "test_trainers_of_robots", "test_sac_her_mp", "test_devices"),
-    *("test_encoder_policies", "test_own_scene", "test_datasets", "test_browser"),
+    *("test_trainers", "test_roadmap_bc", "test_flow", "test_collect", "test_installation"),
+    *("test_evaluation", "test_trainers_of_robots", "test_devices", "test_datasets"),
+    *("test_networks", "test_sac_her_mp", "test_benchmark", "test_examples", "test_commands"),
+    *("test_vector_envs", "test_arm_env", "test_browser", "test_runs", "test_sweep"),
 )
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.distributions import Categorical, Independent, MixtureSameFamily, Normal
-from trainers import PATHS, load, panda_env, refusal, run_here, run_script
+from trainers import PATHS, load, panda_env, run_here, run_script
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.demonstrations import demo_path, load_demos
@@ -93,8 +93,3 @@ def test_longer_run_continues_with_a_mixture_from_two_files(tmp_path, short_epis
     rates = EventAccumulator(str(run)).Reload().Scalars("charts/learning_rate")
     assert [event.step for event in rates] == [1, 101]  # then every ten seconds
     assert rates[-1].value == pytest.approx(1e-3 * (1 - 100 / 200))
-
-
-def test_demonstrations_of_another_task_are_rejected(tmp_path, capsys):
-    message = refusal("bc", capsys, tmp_path, "--demos", str(demo_path("wall")))
-    assert "this file is for the task 'wall', not 'no_obstacles'" in message

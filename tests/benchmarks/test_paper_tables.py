@@ -9,22 +9,9 @@ import paper_tables
 import pytest
 from trainers import succeeds_here
 
-from roboarm_nmp import envs
 from roboarm_nmp.networks.network_file import load_network
 
 CELLS = {cell.name: cell for cell in paper_tables.read_cells()}
-
-
-def test_cells_are_the_papers_numbers_and_commands():
-    papers = [cell for cell in CELLS.values() if cell.mean is not None]
-    assert len(papers) == 3 * 9 * 5 + 4 + 3 + 9 * 6  # goals, hindsight, encoders with BC and SAC
-    assert {cell.task for cell in CELLS.values()} <= set(envs.TASKS)
-    cell = CELLS["sac-combined-pointnet2-random_boxes_hard-p1-on-narrow_shelves"]
-    assert (cell.mean, cell.std) == (0.441, 0.019)
-    assert cell.flags()[:2] == ["--task", "random_boxes_hard"]
-    flags = CELLS["sac-combined-no_obstacles-p0-no_hindsight"].flags()
-    assert flags[-4:] == ["--demo-prob", "0", "--her-probability", "0"]
-    assert "--demo-prob" not in CELLS["bc-ee-wall"].flags()
 
 
 @pytest.fixture

@@ -147,9 +147,7 @@ BELOW = "0.4 0.3 -0.03 1 0 0 0"  # a pose in the table
         (["--task", "wall", "--goal", "1 2"], "--goal must be 7 finite numbers, got '1 2'"),
         (["--task", "moving_boxes_easy", "--goal", GOAL], "obstacles of moving_boxes_easy move"),
         (["--cloud", "none.ply", "--goal", GOAL], "none.ply: no such file"),
-        (["--cloud", "nan.npy", "--goal", GOAL], "500 of 500 points are not finite or out of reac"),
         (["--cloud", "mm.npy", "--goal", GOAL], "200 of 200 points are not finite or out of reach"),
-        (["--cloud", "empty.npy", "--goal", GOAL], "0 of 0 points are not finite or out of reach"),
         (["--cloud", "far.npy", "--goal-pose", "3 0 0 0 0 0 1"], "the arm cannot reach it"),
         (["--task", "wall", "--goal-pose", BELOW], "no collision-free configuration has the goal"),
         (["--cloud", "goal.npy", "--goal", GOAL], "--goal is in collision: a point is"),
@@ -158,8 +156,6 @@ BELOW = "0.4 0.3 -0.03 1 0 0 0"  # a pose in the table
 def test_bad_arguments_give_one_line(arguments, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     np.save("far.npy", np.full((5, 3), 0.9))
-    np.save("nan.npy", np.full((500, 3), np.nan, np.float32))
-    np.save("empty.npy", np.zeros((0, 3)))
     # Around the middle of the hand at the goal.
     hand = PANDA.end_effector_pose([float(word) for word in GOAL.split()])[:3] + (0, 0, 0.1)
     cloud = hand + np.random.default_rng(0).normal(0, 0.02, (200, 3))

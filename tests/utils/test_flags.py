@@ -19,10 +19,7 @@ CASES = [
     ("bc", "--seed", "-1"),
     ("bc", "--device", "cuda:99"),
     ("roadmap_bc", "--runs-dir", "/dev/null/runs"),
-    ("sac_her_mp", "--updates-per-step", "nan"),
     ("td3_her_mp", "--gamma", "1.1"),
-    ("bc", "--num-demos", "0"),
-    ("roadmap_bc", "--safety-margin", "nan"),
     ("pointnet2", "--num-centres", "32 0"),
 ]
 

@@ -8,7 +8,6 @@ import sys
 import pytest
 from paths import LIBRARY, ROOT
 
-from roboarm_nmp.utils.numba_cache import compiled
 from roboarm_nmp.viewer import compile as compile_command
 
 MODULE = """
@@ -137,21 +136,6 @@ def test_compiled_functions_are_in_files_that_the_cache_watches():
     for path in ROOT.rglob("*.py"):
         if not path.is_relative_to(ROOT / "tests") and "import compiled" in path.read_text():
             assert path.name.endswith("kernels.py"), path
-
-
-@compiled
-def _sum(a, b=1):
-    return a + b
-
-
-@compiled
-def _sums(a):
-    return _sum(a, 0) + _sum(3, a) + _sum(a) + _sum(a, b=0.5)
-
-
-def test_called_functions_are_part_of_their_callers_and_can_be_called():
-    assert _sums(2) == 12.5 and not _sum.signatures
-    assert _sum(2) == 3 and _sum(2, b=0.5) == 2.5
 
 
 def test_compile_has_something_to_do_once(tmp_path, monkeypatch, capsys):

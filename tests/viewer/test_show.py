@@ -4,16 +4,14 @@ import os
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
-from torch import nn
+from straight_policy import save
 
 from roboarm_nmp import envs
 from roboarm_nmp.datasets.demonstrations import load_demos
 from roboarm_nmp.datasets.queries import Query, load_queries, write_queries
 from roboarm_nmp.envs.robots.panda import PANDA
 from roboarm_nmp.motions.trajectories import load_joint_path, save_joint_path
-from roboarm_nmp.networks.export import save_network
 from roboarm_nmp.viewer import images, show
 
 SMALL = (96, 72)
@@ -75,21 +73,6 @@ def test_what_was_left_out_of_a_cloud_is_counted(tmp_path, capsys):
 
 
 # --- Animations
-
-
-class Straight(nn.Module):
-    """The go-to-goal policy as a network, for goals that are configurations."""
-
-    def forward(self, observation, achieved_goal, desired_goal):
-        return torch.clamp(desired_goal - observation[:, :7], -1, 1)
-
-
-def save(path, **metadata):
-    sizes = {"observation": 10, "achieved_goal": 7, "desired_goal": 7}
-    inputs = {name: torch.zeros(1, size) for name, size in sizes.items()}
-    metadata = {"kind": "policy", "task": "wall", "env": {"goal_type": "config"}} | metadata
-    save_network(path, Straight(), inputs, metadata, ["action"])
-    return path
 
 
 def test_animation_shows_the_episode_of_a_policy(tmp_path, capsys, monkeypatch):

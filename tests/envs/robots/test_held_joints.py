@@ -114,7 +114,6 @@ def test_scene_files_keep_the_opening(tmp_path):
     [
         ({"thumb": 0.1}, "'thumb' is no held joint; those are panda_finger_joint1, panda_finger_j"),
         ({FINGERS[0]: float("nan")}, "panda_finger_joint1 cannot be held at nan"),
-        ({FINGERS[0]: 1e9}, "panda_finger_joint1 cannot be held at 1000000000.0"),
     ],
 )
 def test_positions_that_cannot_be_are_rejected(positions, reason):

@@ -97,10 +97,6 @@ def test_documented_example_equals_the_scene_written_in_python(load):
             Scene(table=None, floor=None),
         ),  # byte order mark
         (
-            "table: {position: [0, 0, -0.1], size: [1, 1, 0.2], orientation: [0, 0, 1, 0]}",
-            Scene(table=Box((0.0, 0.0, -0.1), (1.0, 1.0, 0.2), (0.0, 0.0, 1.0, 0.0))),
-        ),
-        (
             "obstacles:\n- sphere:\n    radius: 1e-2\n    position:\n"
             "    - 1E1\n    - +.5\n    - -3.\n",
             Scene((Sphere((10.0, 0.5, -3.0), 0.01),)),
@@ -155,10 +151,7 @@ def sphere(position="[0, 0, 0]", radius="1"):
     [
         # Not YAML
         ("floor: 0\ntable: a: b", 2, "mapping values are not allowed"),
-        ("obstacles: [\nfloor: 0: 1]", 2, "while parsing a flow sequence from line 1 on, did not"),
-        ("floor: 0\ntable: *none", 2, "the alias 'none' has no anchor before it"),
         ("floor: 0\n# caf\xe9\n".encode("latin-1"), 2, "byte 0xe9 is not UTF-8 text"),
-        ("# only a comment\n", 1, "the file is empty"),
         # Dangerous
         ("floor: 0\ntable: !!python/object/apply:os.abort []", 2, "tags .* are not allowed"),
         ("floor: 0\nobstacles:\n  " + "- " * 100_000, 3, "nested too deeply"),
@@ -180,10 +173,7 @@ def sphere(position="[0, 0, 0]", radius="1"):
         (obstacle("cube: {}"), 3, "unknown kind of obstacle cube: one of box, cylinder, sphere"),
         (box("radius: 1"), 5, "unknown key radius in box: known are position, size, orient.*, yaw"),
         # Numbers
-        (sphere(radius="1e-400"), 5, "radius of sphere must be positive, got 1e-400"),
         (sphere("[1, -2e9, 3]"), 4, "position of sphere must be at most 1000, got -2e9"),
-        (sphere(radius=".inf"), 5, "radius of sphere must be a finite number, got .inf"),
-        (sphere("[1, 2]"), 4, "position of sphere must be a list of 3 numbers, got 2"),
         (sphere("[1,\n 2,\n left]"), 6, "position of sphere must be a finite number, got left"),
         # Orientation
         (box("orientation: [0, 0, 1, 1]"), 5, r"norm 1 \(within 1 %\), got norm 1.41421356$"),
