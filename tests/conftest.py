@@ -73,6 +73,10 @@ def pytest_collection_finish():
     gc.freeze()
 
 
+def pytest_sessionfinish():
+    gc.unfreeze()  # or OMPL's bindings name all that they think has leaked
+
+
 @pytest.fixture(autouse=True)
 def seeded():
     """What a test draws from global generators is the same in every run and order."""

@@ -461,3 +461,24 @@ def test_sensors_of_a_policy_that_observes_no_scene_are_refused():
     ):
         with pytest.raises(EvaluationError, match="observes nothing of the scene"):
             evaluate(policy, "moving_boxes_easy", **options)
+
+
+FORK = """
+import multiprocessing
+
+import roboarm_nmp
+
+
+def success(seed):
+    result = roboarm_nmp.evaluate("sac-ee-wall-p1-s1", num_queries=3, seed=seed)
+    return result["success_rate"]
+
+
+expected = success(0)
+with multiprocessing.get_context("fork").Pool(2) as pool:
+    assert pool.map_async(success, [0, 0]).get(timeout=60) == [expected, expected]
+"""
+
+
+def test_processes_forked_after_an_evaluation_evaluate(tmp_path):
+    subprocess.run([sys.executable, "-c", FORK], check=True, cwd=tmp_path, timeout=120)
