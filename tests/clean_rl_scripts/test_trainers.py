@@ -92,6 +92,8 @@ def test_run_writes_result_policy_and_tensorboard_events(finished_run, trainer):
     assert isinstance(json.loads((finished_run / "args.json").read_text())["bf16"], bool)
     progress = torch.load(finished_run / "checkpoint.pt", weights_only=True)["progress"]
     assert (progress["evaluated"], progress["best_step"]) == (last, result["policy_step"])
+    if "mp" in trainer:
+        assert progress["updates"] == (600 - 200) * 0.1  # after --learning-starts
 
     events = EventAccumulator(str(finished_run)).Reload()
     scalars = set(events.Tags()["scalars"])

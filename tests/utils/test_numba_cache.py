@@ -1,5 +1,6 @@
 """The cache of compiled functions on disk: damaged files are replaced, changed ones noticed."""
 
+import gc
 import os
 import shutil
 import subprocess
@@ -8,6 +9,7 @@ import sys
 import pytest
 from paths import LIBRARY, ROOT
 
+from roboarm_nmp.utils.numba_cache import compiled
 from roboarm_nmp.viewer import compile as compile_command
 
 MODULE = """
@@ -148,3 +150,19 @@ def test_compile_has_something_to_do_once(tmp_path, monkeypatch, capsys):
     assert "compiled before" in capsys.readouterr().out and calls == ["plan"]
     compile_command.main(compile_command.Args(force=True))
     assert calls == ["plan", "plan"]
+
+
+@compiled
+def _sum(a, b=1):
+    return a + b
+
+
+@compiled
+def _sums(a):
+    return _sum(a, 0) + _sum(3, a) + _sum(a) + _sum(a, b=0.5)
+
+
+def test_called_functions_are_part_of_their_callers_and_can_be_called():
+    assert _sums(2) == 12.5 and not _sum.signatures
+    assert _sum(2) == 3 and _sum(2, b=0.5) == 2.5
+    assert gc.isenabled()  # it rests during compilations
