@@ -118,7 +118,7 @@ class Args(RunArgs):
     num_blocks: flags.Layers = 3
     """number of residual blocks"""
     bf16: bool | None = None
-    """train with hidden layers in bfloat16; by default where the hardware has it"""
+    """train with hidden layers in bfloat16; by default where that is faster"""
 
     safety_margin: flags.NonNegativeFloat = 0.003
     """minimum clearance of the links, m, of the safety filter in the saved policy"""

@@ -103,7 +103,7 @@ class Args(RunArgs):
     plain_networks: bool = False
     """raw observations and goals as inputs"""
     bf16: bool | None = None
-    """train with hidden layers in bfloat16; by default where the hardware has it"""
+    """train with hidden layers in bfloat16; by default where that is faster"""
     encoder: str | None = None
     """the encoded scene in the observation: latent code (`vae`, `vqvae`, `pointnet2`, `field`, or
     the path of your own `encoder.onnx`), `point_cloud`, or `oracle` (ground-truth obstacles)"""

@@ -130,7 +130,7 @@ class Args(RunArgs):
     num_blocks: flags.Layers = 3
     """number of residual blocks"""
     bf16: bool | None = None
-    """train with hidden layers in bfloat16; by default where the hardware has it"""
+    """train with hidden layers in bfloat16; by default where that is faster"""
 
     # The safety filter
     safety_margin: flags.NonNegativeFloat = 0.01

@@ -127,7 +127,8 @@ class Args(RunArgs, EnvArgs):
     """entropy that alpha is tuned to, of the unscaled action; `auto`: minus the number of joints;
     `None`: alpha is constant"""
     policy_average: flags.PositiveShare = 0.0003
-    """share of the policy that moves per update into the average that is saved (1: no averaging)"""
+    """share of the policy that moves per update into the average that is saved (1: no averaging);
+    larger at first"""
     hidden_size: flags.Width = 256
     """width of the hidden layers of policy and critics"""
     num_hidden_layers: flags.Layers = 2
@@ -137,7 +138,7 @@ class Args(RunArgs, EnvArgs):
     plain_networks: bool = False
     """CleanRL's networks: raw inputs, no LayerNorm, actions in [-1, 1] (not in twice the step)"""
     bf16: bool | None = None
-    """train with hidden layers in bfloat16; by default where the hardware has it"""
+    """train with hidden layers in bfloat16; by default where that is faster"""
     eval_every: flags.PositiveInt = 25_000
     """environment steps between evaluations on validation queries"""
     stop_at_success: flags.Share | None = None
@@ -419,7 +420,6 @@ class SAC(nn.Module):
         (actor_loss + alpha_loss).backward()
         self.actor_optimizer.step()
         self.critics.requires_grad_(True)
-        polyak_update(self.actor_average, self.actor, args.policy_average)
         return losses | {"actor_loss": actor_loss, "alpha_loss": alpha_loss}
 
 
@@ -540,6 +540,9 @@ if __name__ == "__main__":
             losses |= update_critics(data)
             if progress["updates"] % POLICY_FREQUENCY == 0:
                 losses |= update_actor(data)
+                # Faster at first, or the average would keep much of the untrained policy.
+                share = max(args.policy_average, 8.0 / (progress["updates"] + 8))
+                polyak_update(agent.actor_average, agent.actor, share)
             progress["updates"] += 1
             if time.monotonic() - logged > LOG_SECONDS or progress["updates"] == 1:
                 logged = time.monotonic()

@@ -87,7 +87,7 @@ class Args(EncoderFlags):  # whose flags are in `training_data.py`
     width: Width = 128
     """features of a sector"""
     bf16: bool | None = None
-    """train with products in bfloat16; by default where the hardware has it"""
+    """train with products in bfloat16; by default where that is faster"""
 
 
 # MODEL

@@ -144,6 +144,12 @@ def test_saved_policy_is_the_running_average_and_acts_without_the_script(
             torch.testing.assert_close(action, average(**inputs))
         assert (average(**inputs) - actor(**inputs)).abs().max() > 1e-4
         assert evaluate(finished_run, num_queries=1)["goal_type"] == "pose"
+    if trainer == "sac_her_mp":  # which forgets the untrained policy soon
+        torch.manual_seed(1)
+        untrained = load(trainer).Actor(load(trainer).Args(hidden_size=16), env).mlp[0].weight
+        agent = torch.load(finished_run / "checkpoint.pt", weights_only=True)["agent"]
+        trained, average = agent["actor.mlp.0.weight"], agent["actor_average.mlp.0.weight"]
+        assert 0 < (average - trained).norm() < 0.5 * (untrained - trained).norm() < 1
 
 
 def assert_same(one, other):

@@ -117,7 +117,7 @@ def test_resumed_run_keeps_its_choice_of_bfloat16(parse, tmp_path, monkeypatch):
         bf16: bool | None = None
 
     def begin(supported, *flags):
-        monkeypatch.setattr("torch.cpu._is_avx512_bf16_supported", lambda: supported)
+        monkeypatch.setattr("torch.cpu._is_amx_tile_supported", lambda: supported)
         args = parse(*flags, kind=WithBf16)
         return args.bf16, folder_of(args)
 
@@ -184,12 +184,11 @@ def test_run_continues_with_every_part_its_step_and_its_time(parse, tmp_path):
     assert 100 < resumed.seconds < 115 and resumed.step == 5
     for newer, name in (
         ({"critic": torch.nn.Linear(1, 1)}, "critic"),
-        ({"counts_of_mine": {"updates": 0, "best_step": 0}}, "best_step"),
+        ({"counts_of_mine": {"updates": 0, "best_step": 0}}, "counts_of_mine"),
+        ({"model": torch.nn.Linear(4, 2)}, "model"),
     ):
-        with pytest.raises(SystemExit, match=f"of another version: it has no {name}"):
+        with pytest.raises(SystemExit, match=f"version of the trainer: its {name} differs$"):
             runs.Run(resumed.args, "wall", after | newer)
-    with pytest.raises(SystemExit, match="of another version: the layers of its model are others$"):
-        runs.Run(resumed.args, "wall", after | {"model": torch.nn.Linear(4, 2)})
 
 
 def test_parameters_that_are_not_finite_are_not_saved(parse, tmp_path):

@@ -15,6 +15,7 @@ from typing import Any, NoReturn, TypeVar
 import torch
 
 from roboarm_nmp.envs.robots.files import ROBOT_FILES
+from roboarm_nmp.training.devices import has_fast_bfloat16
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.files import check_folder
 from roboarm_nmp.utils.signals import end_with_one_line, error_line
@@ -26,7 +27,7 @@ MAY_CHANGE = {"resume", "runs_dir", "track"}  # they change no number
 def parse_args(Args: type[Flags], may_change: Collection[str] = ()) -> Flags:
     """The flags of the command line; with --resume the run's, which must not be contradicted.
 
-    A flag `bf16` that is None is decided: whether the hardware has bfloat16.
+    A flag `bf16` that is None is decided: whether bfloat16 is faster on the device.
 
     Args:
         Args: the dataclass of the flags, `runs_dir`, `resume`, `device` and `track` among them.
@@ -58,7 +59,7 @@ def parse_args(Args: type[Flags], may_change: Collection[str] = ()) -> Flags:
     if args.track and importlib.util.find_spec("wandb") is None:
         fail("--track: wandb is not installed (pip install wandb)")
     if getattr(args, "bf16", False) is None:  # args.json has the choice: resuming keeps it
-        args.bf16 = args.device != "cpu" or torch.cpu._is_avx512_bf16_supported()
+        args.bf16 = args.device != "cpu" or has_fast_bfloat16()
     return args
 
 

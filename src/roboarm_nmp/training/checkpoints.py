@@ -55,10 +55,8 @@ def load_checkpoint(path: Path, parts: dict[str, Any], device: str) -> None:
     for name, part in parts.items():
         try:
             _restore(part, state[name])
-        except KeyError as error:
-            fail(f"--resume: {path} is of another version: it has no {error.args[0]}")
-        except RuntimeError:  # PyTorch's, which lists all weights
-            fail(f"--resume: {path} is of another version: the layers of its {name} are others")
+        except (KeyError, RuntimeError):  # PyTorch's, which lists all weights
+            fail(f"--resume: {path} is of another version of the trainer: its {name} differs")
     torch.set_rng_state(state["torch_rng"])
     if "cuda_rng" in state:
         torch.cuda.set_rng_state(state["cuda_rng"], device)

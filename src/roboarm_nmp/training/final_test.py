@@ -1,7 +1,4 @@
-"""The queries of a trainer of policies, and the test of its best policy at the end.
-
-These functions are for scripts: on a mistake of the user, they end the program with a message.
-"""
+"""The queries of a trainer of policies, and the test of its best policy at the end."""
 
 import sys
 from typing import Any
@@ -31,18 +28,14 @@ def load_task(args: Any) -> tuple[Queries, Queries]:
         test = load_queries(args.task, "test")
     except ValueError as error:
         fail(f"--task: {error}")
-    for flag, number, queries in (
-        ("--eval-queries", args.eval_queries, validation),
-        ("--test-queries", args.test_queries, test),
-    ):
-        if number > len(queries):
-            print(f"{flag} {number}: there are {len(queries)}, all are used", file=sys.stderr)
+    for kind, queries in (("eval", validation), ("test", test)):
+        if (number := getattr(args, f"{kind}_queries")) > len(queries):
+            text = f"--{kind}-queries {number}: there are {len(queries)}, all are used"
+            print(text, file=sys.stderr)
     return validation[: args.eval_queries], test[: args.test_queries]  # pyright: ignore
 
 
-def finish(
-    run: Run, test: Queries, best_success: float, best_step: int, num_workers: int = 1
-) -> None:
+def finish(run: Run, test: Queries, best_success: float, best_step: int, workers: int = 1) -> None:
     """End a run: test `policy.onnx`, write `result.json`, and print a line.
 
     The test is under the task's standard rules, whatever the training's were: 400 steps, contacts
@@ -52,7 +45,7 @@ def finish(
         run: the run.
         test: test queries.
         best_success, best_step: of the best evaluation on validation queries.
-        num_workers: processes of the test.
+        workers: processes of the test.
     """
     from roboarm_nmp.evaluation.evaluate import evaluate  # slow to import, and not for --help
 
@@ -61,7 +54,7 @@ def finish(
     result: dict[str, Any] = {"task": run.args.task, "goal_type": run.args.goal_type}
     text = "no test, --test-queries 0"
     if len(test):
-        tested = evaluate(policy, run.args.task, queries=test, workers=num_workers, progress=True)
+        tested = evaluate(policy, run.args.task, queries=test, workers=workers, progress=True)
         names = (*RESULTS, "num_queries", "robot", "privileged", "deviations")
         result |= {name: tested[name] for name in names}
         text = (

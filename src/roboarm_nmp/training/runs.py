@@ -152,10 +152,9 @@ class Run:
     def log(self, values: dict) -> None:
         """Write a dict of numbers to TensorBoard; of a tensor its mean, of None nothing."""
         for name, value in values.items():
-            if value is None:
-                continue
-            value = value.mean().item() if isinstance(value, torch.Tensor) else value
-            self.writer.add_scalar(name, value, self.step)
+            value = value.mean() if isinstance(value, torch.Tensor) else value
+            if value is not None:
+                self.writer.add_scalar(name, value, self.step)
 
     def log_image(self, name: str, image: np.ndarray) -> None:
         """Write an image, uint8 (height, width, 3), to TensorBoard."""
