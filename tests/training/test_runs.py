@@ -17,7 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from roboarm_nmp.training import runs
 from roboarm_nmp.training.arguments import parse_args
-from roboarm_nmp.training.devices import seed_torch
+from roboarm_nmp.training.devices import has_fast_bfloat16, seed_torch
 from roboarm_nmp.utils import flags
 from roboarm_nmp.utils.files import new_contents
 
@@ -127,6 +127,22 @@ def test_resumed_run_keeps_its_choice_of_bfloat16(parse, tmp_path, monkeypatch):
         assert json.loads((run / "args.json").read_text())["bf16"] is supported
         assert begin(not supported, "--resume", run)[0] is supported
     assert begin(False, "--runs-dir", tmp_path, "--bf16", "True")[0] is True
+
+
+@pytest.mark.parametrize(
+    "cpu, avx512_bf16, amx, fast",
+    [
+        ("znver4", True, False, True),
+        ("znver3", False, False, False),
+        ("sapphirerapids", True, False, False),  # in a virtual machine without AMX
+        ("sapphirerapids", True, True, True),
+    ],
+)
+def test_bfloat16_is_chosen_where_it_is_faster(cpu, avx512_bf16, amx, fast, monkeypatch):
+    monkeypatch.setattr("llvmlite.binding.get_host_cpu_name", lambda: cpu)
+    monkeypatch.setattr("torch.cpu._is_avx512_bf16_supported", lambda: avx512_bf16)
+    monkeypatch.setattr("torch.cpu._is_amx_tile_supported", lambda: amx)
+    assert has_fast_bfloat16() is fast
 
 
 def parts():
