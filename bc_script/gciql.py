@@ -219,8 +219,15 @@ LOG_SECONDS = 10  # between two logs of the losses
 MAX_WEIGHT = 100.0  # of an action in advantage-weighted regression
 
 
-class GCIQL:
+def step(optimizer, loss):
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+
+
+class GCIQL(nn.Module):
     def __init__(self, args, env, device):
+        super().__init__()
         self.args = args
         self.actor = Actor(args, env).to(device)
         self.actor_average = Actor(args, env).to(device).eval()  # evaluated and saved
@@ -230,13 +237,9 @@ class GCIQL:
         self.critics_target = Critics(args, features).to(device)
         self.critics_target.load_state_dict(self.critics.state_dict())
         self.value = mlp(features.size, 1, args, layer_norm=True).to(device)
-        self.optimizers = {
-            name: adam(getattr(self, name).parameters(), args.learning_rate, device)
-            for name in ("actor", "critics", "value")
-        }
-        names = ("actor", "actor_average", "critics", "critics_target", "value")
-        self.state = {name: getattr(self, name) for name in names}
-        self.state |= {f"{name}_optimizer": one for name, one in self.optimizers.items()}
+        self.actor_optimizer = adam(self.actor.parameters(), args.learning_rate, device)
+        self.critic_optimizer = adam(self.critics.parameters(), args.learning_rate, device)
+        self.value_optimizer = adam(self.value.parameters(), args.learning_rate, device)
 
     def update(self, data):
         """A step of all networks on a batch. Returns tensors whose means are logged."""
@@ -253,20 +256,14 @@ class GCIQL:
         value_loss = (weight * surplus.square()).mean()
         qf_values = self.critics(features, action)
         qf_losses = (qf_values - target).square().mean(1)  # of Q1 and of Q2
-        self.step(value_loss, "value")
-        self.step(qf_losses.sum(), "critics")
+        step(self.value_optimizer, value_loss)
+        step(self.critic_optimizer, qf_losses.sum())
         actor_loss = self.actor_loss(data)
-        self.step(actor_loss, "actor")
+        step(self.actor_optimizer, actor_loss)
         polyak_update(self.critics_target, self.critics, args.tau)
         polyak_update(self.actor_average, self.actor, args.policy_average)
         losses = {"value_loss": value_loss, "qf_loss": qf_losses, "actor_loss": actor_loss}
         return losses | {"qf1_values": qf_values[0]}
-
-    def step(self, loss, name):
-        """A step of the optimiser of a network."""
-        self.optimizers[name].zero_grad()
-        loss.backward()
-        self.optimizers[name].step()
 
     def actor_loss(self, data):
         """The policy's loss, of a Gaussian with standard deviation 1 (in units of `MAX_STEP`)."""
@@ -302,7 +299,11 @@ if __name__ == "__main__":
     update = graphed(agent.update, device)
     rng = np.random.default_rng(args.seed)
     progress = {"evaluated": 0, "best": -1.0, "best_step": 0}
-    run = Run(args, task_name(args.task), agent.state | {"rng": rng, "progress": progress})
+    state = {"agent": agent, "rng": rng, "progress": progress}
+    state["actor_optimizer"] = agent.actor_optimizer
+    state["critic_optimizer"] = agent.critic_optimizer
+    state["value_optimizer"] = agent.value_optimizer
+    run = Run(args, task_name(args.task), state)
     with errors_of("--encoder"):  # scenes are encoded, which takes minutes the first time
         data = DemoSteps(demos, args.goal_type, getattr(env, "encoder", None))
     del demos
