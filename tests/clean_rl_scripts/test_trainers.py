@@ -39,7 +39,7 @@ def trainer(request):
 
 FINISHED = {
     "sac_her_mp": ["--goal-type", "combined", "--velocities"],
-    "td3_her_mp": ["--goal-type", "config", "--capture-video"],
+    "td3_her_mp": ["--goal-type", "config", "--capture-video", "--policy-average", "1"],
     "crl_mp": ["--goal-type", "ee"],
     "bc": ["--goal-type", "pose", "--policy-average", "0.01"],
     "gciql": ["--goal-type", "config"],
@@ -144,11 +144,14 @@ def test_saved_policy_is_the_running_average_and_acts_without_the_script(
             torch.testing.assert_close(action, average(**inputs))
         assert (average(**inputs) - actor(**inputs)).abs().max() > 1e-4
         assert evaluate(finished_run, num_queries=1)["goal_type"] == "pose"
-    if trainer == "sac_her_mp":  # which forgets the untrained policy soon
-        torch.manual_seed(1)
-        untrained = load(trainer).Actor(load(trainer).Args(hidden_size=16), env).mlp[0].weight
+    if trainer in ("sac_her_mp", "td3_her_mp"):
         agent = torch.load(finished_run / "checkpoint.pt", weights_only=True)["agent"]
         trained, average = agent["actor.mlp.0.weight"], agent["actor_average.mlp.0.weight"]
+    if trainer == "td3_her_mp":  # --policy-average 1
+        assert torch.equal(average, trained)
+    if trainer == "sac_her_mp":  # whose average forgets the untrained policy soon
+        torch.manual_seed(1)
+        untrained = load(trainer).Actor(load(trainer).Args(hidden_size=16), env).mlp[0].weight
         assert 0 < (average - trained).norm() < 0.5 * (untrained - trained).norm() < 1
 
 

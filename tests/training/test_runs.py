@@ -117,7 +117,7 @@ def test_resumed_run_keeps_its_choice_of_bfloat16(parse, tmp_path, monkeypatch):
         bf16: bool | None = None
 
     def begin(supported, *flags):
-        monkeypatch.setattr("torch.cpu._is_amx_tile_supported", lambda: supported)
+        monkeypatch.setattr("roboarm_nmp.training.arguments.has_fast_bfloat16", lambda: supported)
         args = parse(*flags, kind=WithBf16)
         return args.bf16, folder_of(args)
 

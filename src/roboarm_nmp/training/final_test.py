@@ -29,9 +29,9 @@ def load_task(args: Any) -> tuple[Queries, Queries]:
     except ValueError as error:
         fail(f"--task: {error}")
     for kind, queries in (("eval", validation), ("test", test)):
-        if (number := getattr(args, f"{kind}_queries")) > len(queries):
-            text = f"--{kind}-queries {number}: there are {len(queries)}, all are used"
-            print(text, file=sys.stderr)
+        number = getattr(args, f"{kind}_queries")
+        if number > len(queries):
+            print(f"--{kind}-queries {number}: there are only {len(queries)}", file=sys.stderr)
     return validation[: args.eval_queries], test[: args.test_queries]  # pyright: ignore
 
 
