@@ -147,12 +147,12 @@ def test_saved_policy_is_the_running_average_and_acts_without_the_script(
     if trainer in ("sac_her_mp", "td3_her_mp"):
         agent = torch.load(finished_run / "checkpoint.pt", weights_only=True)["agent"]
         trained, average = agent["actor.mlp.0.weight"], agent["actor_average.mlp.0.weight"]
-    if trainer == "td3_her_mp":  # --policy-average 1
-        assert torch.equal(average, trained)
-    if trainer == "sac_her_mp":  # whose average forgets the untrained policy soon
-        torch.manual_seed(1)
-        untrained = load(trainer).Actor(load(trainer).Args(hidden_size=16), env).mlp[0].weight
-        assert 0 < (average - trained).norm() < 0.5 * (untrained - trained).norm() < 1
+        if trainer == "td3_her_mp":  # --policy-average 1
+            assert torch.equal(average, trained)
+        else:  # the average forgets the untrained policy soon
+            torch.manual_seed(1)
+            untrained = load(trainer).Actor(load(trainer).Args(hidden_size=16), env).mlp[0].weight
+            assert 0 < (average - trained).norm() < 0.5 * (untrained - trained).norm() < 1
 
 
 def assert_same(one, other):
