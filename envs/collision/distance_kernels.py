@@ -246,7 +246,7 @@ def _cloud_distance(
     `gaps`: working memory, two arrays for all groups and all points: their distance (m) from the
     box around the body, a lower bound of their distance from its hull.
     """
-    _, points, groups, ball = world
+    _, points, groups, ball, _ = world
     of_groups, of_points = gaps
     box_gaps(bodies, k, frames, centres, groups, 0, groups.shape[0], of_groups)
     middle = -1
@@ -319,7 +319,7 @@ def signed_distances_batch(
     two more for nothing.
     """
     chain, bodies, pairs, vertices, cells = arm
-    rows, points, groups, ball = world
+    rows, points, groups, ball, _ = world
     frames, centres, pose, s, other = working_memory(chain, bodies)
     polytope = (
         np.empty((_EPA_VERTICES, 6)),

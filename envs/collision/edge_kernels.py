@@ -40,6 +40,8 @@ from roboarm_nmp.envs.collision.gjk_kernels import (
 from roboarm_nmp.envs.collision.grid_kernels import offsets
 from roboarm_nmp.envs.collision.lanes_kernels import (
     WIDTH,
+    floor,
+    gathered,
     lane,
     larger,
     largest,
@@ -47,6 +49,7 @@ from roboarm_nmp.envs.collision.lanes_kernels import (
     load,
     lowest,
     root,
+    smaller,
     spread,
     store,
 )
@@ -56,6 +59,7 @@ from roboarm_nmp.utils.numba_cache import compiled, inlined, uncounted
 # What is undecided in a block: a body and a shape; or one of these and a pair's index, or a body.
 PAIR, CLOUD = -1, -2
 _HIT = -1
+_ALL = 2**WIDTH - 1  # lanes
 
 
 @compiled
@@ -289,11 +293,12 @@ def _against_links(margins, count, moves, pairs, arm32, block):
 def _against_points(margins, count, clearance, moves, arm32, world, grid, block):
     """Add the bodies that may be near a point of the cloud to the list of `count`; its length."""
     _, bodies, outer, outer_begin, _, _ = arm32
-    _, _, states, undecided, _, _, _, spheres, _, _ = block
+    _, _, _, undecided, _, _, _, spheres, _, _ = block
     near, numbers, place = grid
-    ball = world[3]
-    nx, ny, nz = numbers[0], numbers[1], numbers[2]
-    own = states[states.shape[0] - 3 * WIDTH :]
+    ball, nothing = world[3], spread(F32(0.0))
+    last_x = spread(F32(numbers[0]) - F32(0.5))
+    last_y = spread(F32(numbers[1]) - F32(0.5))
+    last_z = spread(F32(numbers[2]) - F32(0.5))
     margins = margins + (clearance + F32(ball[0, 16]))
     for k in range(bodies.shape[0] - 1, -1, -1):
         if bodies[k, LINK_ROW] < F32(0.0):
@@ -303,23 +308,16 @@ def _against_points(margins, count, clearance, moves, arm32, world, grid, block)
         left = 0
         for i in range(outer_begin[k], outer_begin[k + 1]):
             x, y, z = _place_of(spheres, i)
-            x, y, z = (
-                (x - place[0]) * place[3],
-                (y - place[1]) * place[3],
-                (z - place[2]) * place[3],
-            )
-            store(own, 0, x)
-            store(own, WIDTH, y)
-            store(own, 2 * WIDTH, z)
+            # (Outside of the grid, the nearest place in it is not farther from any point.)
+            x = smaller(larger((x - place[0]) * place[3], nothing), last_x)
+            y = smaller(larger((y - place[1]) * place[3], nothing), last_y)
+            z = smaller(larger((z - place[2]) * place[3], nothing), last_z)
             # (1 um for rounding)
             reaches = gaps + (outer[i, 3] + F32(1e-6)) + offsets(x, y, z, place)
-            for n in range(WIDTH):
-                u, v, w = own[n], own[WIDTH + n], own[2 * WIDTH + n]
-                squared = place[4]  # outside of the grid
-                if u >= 0.0 and v >= 0.0 and w >= 0.0 and u < nx and v < ny and w < nz:
-                    squared = near[(int(u) * ny + int(v)) * nz + int(w)]
-                own[n] = squared
-            left |= less(load(own, 0), reaches * reaches)
+            cell = (floor(x) * F32(numbers[1]) + floor(y)) * F32(numbers[2]) + floor(z)
+            left |= less(gathered(near, cell), reaches * reaches)
+            if left == _ALL:
+                break
         if left != 0:
             undecided[count, 0], undecided[count, 1], undecided[count, 2] = CLOUD, k, left
             count += 1
@@ -387,6 +385,19 @@ def _write_pose(bodies, k, here, block, frames, centres):
 
 
 @uncounted
+def _most_undecided(undecided, count):
+    """The lane in which most is undecided: probably, something touches there."""
+    most = best = 0
+    for here in range(WIDTH):
+        number = 0
+        for i in range(count):
+            number += (undecided[i, 2] >> here) & 1
+        if number > most:
+            most, best = number, here
+    return best
+
+
+@uncounted
 def _are_apart(
     start, end, first, step, last, pieces, count, lanes, rule, endpoint_margins, arm, world, block,
     single,
@@ -398,9 +409,11 @@ def _are_apart(
     _, _, _, undecided, axes, q, _, _, _, _ = block
     n, shapes = start.shape[0], rows.shape[0]
     before = -1
+    here = _most_undecided(undecided, count)
     while lanes != 0:
-        here = lowest(lanes)
-        lanes &= lanes - 1
+        if (lanes >> here) & 1 == 0:
+            here = lowest(lanes)
+        lanes &= ~(1 << here)
         number = min(first + here * step, last)
         if number == before:  # the last lanes may be the same state
             break
@@ -473,11 +486,11 @@ def first_free(paths, orders, rule, endpoint_margins, arm, arm32, world, grid):
 
 @compiled
 def single_motion(
-    rule, ends, chain, bodies, pairs, vertices, cells, arm32, rows, points, groups, ball, grid,
-    start, end,
+    rule, ends, chain, bodies, pairs, vertices, cells, arm32, rows, points, groups, ball, blocks,
+    grid, start, end,
 ):  # fmt: skip
     """`check_motion` for Python, which takes longer to pass nested tuples than their arrays."""
-    arm, world = (chain, bodies, pairs, vertices, cells), (rows, points, groups, ball)
+    arm, world = (chain, bodies, pairs, vertices, cells), (rows, points, groups, ball, blocks)
     q, stop = np.array(start), np.array(end)
     memory = block_memory(arm, arm32, world)
     return check_motion(q, stop, 1, rule, ends, arm, arm32, world, grid, memory)

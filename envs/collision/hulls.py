@@ -32,7 +32,7 @@ from roboarm_nmp.envs.collision.arm_kernels import (
     SPHERE,
 )
 from roboarm_nmp.envs.collision.gjk_kernels import BULLET_MARGIN, CELLS, rows_of_primitives
-from roboarm_nmp.envs.collision.grid_kernels import first_in_cells, group_cubes
+from roboarm_nmp.envs.collision.grid_kernels import blocks_of_points, first_in_cells, group_cubes
 from roboarm_nmp.envs.robots.body import body_alone, collision_elements
 from roboarm_nmp.envs.robots.robot import Link, Robot
 from roboarm_nmp.envs.robots.rotations import matrix
@@ -372,7 +372,7 @@ def shape_centres(obstacles: Sequence) -> np.ndarray:
     return centres
 
 
-def group_points(points, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def group_points(points, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple]:
     """Points in groups of neighbours, as the compiled functions take them. Raises ValueError.
 
     Returns:
@@ -380,7 +380,8 @@ def group_points(points, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndar
         the cube's points from it (of others 0), and the index after the cube's last point (of
         others the next one's). `groups`: float64 (g, 6): the centre (m) of a group, the largest
         distance (m) of its points from the centre, the index of its first point, and the index
-        after its last. `ball`: float64 (1, `ROW`), a point as a shape.
+        after its last. `ball`: float64 (1, `ROW`), a point as a shape. And the points as
+        `grid_kernels.blocks_of_points` returns them.
     """
     points = np.asarray(points, dtype=np.float64)
     if not points.size and radius == 0.0:
@@ -405,8 +406,14 @@ def group_points(points, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndar
     points, groups = group_cubes(points, cubes, order, count, number)
     ball = np.zeros((1, ROW))
     ball[0, 0], ball[0, 16] = SPHERE, radius
-    return points, groups, ball
+    return points, groups, ball, blocks_of_points(points, groups)
 
 
-_NO_POINTS = np.empty((0, 5)), np.empty((0, 6)), np.zeros((1, ROW))
+_NOTHING = np.empty(0, np.float32)
+_NO_POINTS = (
+    np.empty((0, 5)),
+    np.empty((0, 6)),
+    np.zeros((1, ROW)),
+    (_NOTHING, _NOTHING, np.empty(0, np.int64)),
+)
 _NO_POINTS[2][0, 0] = SPHERE

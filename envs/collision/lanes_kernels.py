@@ -86,6 +86,17 @@ def _load(context, builder, kinds, values):
     return vector
 
 
+def _gathered(context, builder, kinds, values):
+    data = context.make_array(kinds[0])(context, builder, values[0]).data
+    places = builder.fptosi(values[1], ir.VectorType(_INDEX, WIDTH))
+    vector = ir.Constant(_VECTOR, ir.Undefined)
+    for i in range(WIDTH):
+        lane = ir.Constant(_INDEX, i)
+        number = builder.load(builder.gep(data, [builder.extract_element(places, lane)]))
+        vector = builder.insert_element(vector, number, lane)
+    return vector
+
+
 def _store(context, builder, kinds, values):
     written = builder.store(values[2], _pointer(context, builder, kinds, values))
     written.align = 4
@@ -137,12 +148,15 @@ load = _intrinsic(_as_lanes, _load, None, types.intp)
 """`load(array, i)`: the elements i to i + 15 of a contiguous float32 array (n,)."""
 store = _intrinsic(lambda *kinds: types.void(*kinds), _store, None, types.intp, _lanes)
 """`store(array, i, lanes)`: write them there."""
+gathered = _intrinsic(_as_lanes, _gathered, None, _lanes)
+"""`gathered(array, places)`: the elements at places, which are whole numbers."""
 spread = _intrinsic(_as_lanes, lambda c, builder, k, v: _spread(builder, v[0]), types.float32)
 """`spread(x)`: a float32 number in all lanes."""
 fused = _intrinsic(_as_lanes, _call("llvm.fma"), *_three)
 """`fused(a, b, c)`: a b + c, rounded once."""
 root = _intrinsic(_as_lanes, _call("llvm.sqrt"), _lanes)
 magnitude = _intrinsic(_as_lanes, _call("llvm.fabs"), _lanes)
+floor = _intrinsic(_as_lanes, _call("llvm.floor"), _lanes)
 nearest_int = _intrinsic(_as_lanes, _call("llvm.rint"), _lanes)
 larger = _intrinsic(_as_lanes, _select(">"), *_two)
 smaller = _intrinsic(_as_lanes, _select("<"), *_two)

@@ -3,6 +3,9 @@
 import math
 
 from roboarm_nmp.envs.collision.arm_kernels import (
+    FAR,
+    FRAME,
+    HALF,
     LINK_ROW,
     RADIUS,
     ROUNDING,
@@ -10,7 +13,9 @@ from roboarm_nmp.envs.collision.arm_kernels import (
     place_arm,
     working_memory,
 )
+from roboarm_nmp.envs.collision.block_kernels import F32, squared_length
 from roboarm_nmp.envs.collision.gjk_kernels import (
+    ROUNDING_ERROR,
     begin_gjk,
     box_gap,
     gjk,
@@ -18,7 +23,18 @@ from roboarm_nmp.envs.collision.gjk_kernels import (
     sphere_gap,
     write_body_row,
 )
+from roboarm_nmp.envs.collision.lanes_kernels import (
+    WIDTH,
+    larger,
+    less,
+    load,
+    lowest,
+    magnitude,
+    spread,
+)
 from roboarm_nmp.utils.numba_cache import compiled, uncounted
+
+_SLACK = 1e-5  # m: more than rounding to float32 changes
 
 
 @uncounted
@@ -37,7 +53,7 @@ def margin_of(q, rule, endpoint_margins):
 def is_free(q, rule, endpoint_margins, arm, world, memory):
     """`CollisionChecker.is_free` of one state."""
     chain, bodies, pairs, vertices, cells = arm
-    rows, _, groups, ball = world
+    rows, _, groups, ball, _ = world
     frames, centres, pose, s, other = memory
     touching = rows.shape[1] > ROW
     margin, clearance = margin_of(q, rule, endpoint_margins), rule[1]
@@ -79,27 +95,57 @@ def is_free(q, rule, endpoint_margins, arm, world, memory):
 @uncounted
 def is_apart_from_points(bodies, vertices, cells, k, world, frames, centres, pose, s, gap):
     """Whether a body's hull is at least `gap` (m) from all points of the cloud."""
-    _, points, groups, ball = world
-    for g in range(groups.shape[0]):
-        x, y, z = (
-            groups[g, 0] - centres[k, 0],
-            groups[g, 1] - centres[k, 1],
-            groups[g, 2] - centres[k, 2],
-        )
-        reach = bodies[k, RADIUS] + groups[g, 3] + gap
-        if x * x + y * y + z * z >= reach * reach:
-            continue
-        if box_gap(bodies, k, frames, centres, groups, g, pose) >= groups[g, 3] + gap:
-            continue
-        j = int(groups[g, 4])
-        while j < groups[g, 5]:
-            away = box_gap(bodies, k, frames, centres, points, j, pose)
-            if away < gap:
+    _, points, _, ball, (balls, columns, begins) = world
+    if gap <= 0.0:
+        return True
+    f = frames[int(bodies[k, FRAME])]
+    x, y, z = F32(centres[k, 0]), F32(centres[k, 1]), F32(centres[k, 2])
+    xx, xy, xz = F32(f[0]), F32(f[1]), F32(f[2])
+    yx, yy, yz = F32(f[3]), F32(f[4]), F32(f[5])
+    zx, zy, zz = F32(f[6]), F32(f[7]), F32(f[8])
+    half_x, half_y, half_z = (
+        F32(bodies[k, HALF]),
+        F32(bodies[k, HALF + 1]),
+        F32(bodies[k, HALF + 2]),
+    )
+    reach, within = F32(bodies[k, RADIUS] + gap + _SLACK), F32((gap + _SLACK) ** 2)
+    zero = spread(F32(0.0))
+    # A plane with the whole hull behind it, of the last point that GJK found apart: it settles most
+    # of the others.
+    nx = ny = nz = 0.0
+    behind = FAR
+    for first in range(0, begins.shape[0], WIDTH):
+        u = load(balls, 4 * first) - x
+        v = load(balls, 4 * first + WIDTH) - y
+        w = load(balls, 4 * first + 2 * WIDTH) - z
+        reaches = load(balls, 4 * first + 3 * WIDTH) + reach
+        near = less(squared_length(u, v, w), reaches * reaches)
+        while near != 0:
+            block = first + lowest(near)
+            near &= near - 1
+            u = load(columns, 3 * WIDTH * block) - x
+            v = load(columns, 3 * WIDTH * block + WIDTH) - y
+            w = load(columns, 3 * WIDTH * block + 2 * WIDTH) - z
+            # From the box around the body.
+            a = larger(magnitude(u * xx + v * yx + w * zx) - half_x, zero)
+            b = larger(magnitude(u * xy + v * yy + w * zy) - half_y, zero)
+            c = larger(magnitude(u * xz + v * yz + w * zz) - half_z, zero)
+            left = less(squared_length(a, b, c), spread(within))
+            while left != 0:
+                j = begins[block] + lowest(left)
+                left &= left - 1
+                if box_gap(bodies, k, frames, centres, points, j, pose) >= gap:
+                    continue
+                along = nx * pose[9] + ny * pose[10] + nz * pose[11]
+                if along >= behind + gap:
+                    continue
                 begin_gjk(ball, 0, pose, s)
                 if gjk(vertices, cells, k, ball, 0, pose, s, gap, gap)[0] < gap:
                     return False
-            # The points of its cube are in a ball around it.
-            j = j + 1 if away < gap + points[j, 3] else int(points[j, 4])
+                norm = math.sqrt(s[28] * s[28] + s[29] * s[29] + s[30] * s[30])
+                nx, ny, nz = -s[28] / norm, -s[29] / norm, -s[30] / norm
+                along = nx * pose[9] + ny * pose[10] + nz * pose[11]
+                behind = along - s[31] + ROUNDING_ERROR
     return True
 
 
