@@ -95,7 +95,7 @@ def group_cubes(points, cubes, order, count, group):
         group: int64 (m,), the group of each cube, ascending along `order`.
     """
     m = order.shape[0]
-    begins, arranged = np.empty(m, np.int64), np.zeros((points.shape[0], 5))
+    begins, arranged = np.empty(m, np.int64), np.empty((points.shape[0], 4))
     groups = np.empty((group[order[m - 1]] + 1 if m else 0, 6))
     _arrange(points, cubes, order, count, begins, arranged)
     first = 0
@@ -119,14 +119,10 @@ def _arrange(points, cubes, order, count, begins, arranged):
         begins[cubes[i]] += 1
         for axis in range(3):
             arranged[j, axis] = points[i, axis]
-        arranged[j, 4] = j + 1
+        arranged[j, 3] = j + 1
     for i in range(order.shape[0]):
         begins[i] -= count[i]
-        j, end = begins[i], begins[i] + count[i]
-        farthest = 0.0
-        for k in range(j + 1, end):
-            farthest = max(farthest, _squared(arranged, k, arranged, j))
-        arranged[j, 3], arranged[j, 4] = math.sqrt(farthest) + 1e-9, end
+        arranged[begins[i], 3] = begins[i] + count[i]
 
 
 @uncounted
@@ -137,11 +133,13 @@ def _squared(rows, i, others, j):
 
 @uncounted
 def _write_group(points, begin, end, groups, g):
-    for axis in range(3):
-        low = high = points[begin, axis]
-        for i in range(begin, end):
-            low, high = min(low, points[i, axis]), max(high, points[i, axis])
-        groups[g, axis] = (low + high) / 2.0
+    x, y, z = points[begin, 0], points[begin, 1], points[begin, 2]
+    u, v, w = x, y, z
+    for i in range(begin + 1, end):
+        x, u = min(x, points[i, 0]), max(u, points[i, 0])
+        y, v = min(y, points[i, 1]), max(v, points[i, 1])
+        z, w = min(z, points[i, 2]), max(w, points[i, 2])
+    groups[g, 0], groups[g, 1], groups[g, 2] = (x + u) / 2.0, (y + v) / 2.0, (z + w) / 2.0
     farthest = 0.0
     for i in range(begin, end):
         farthest = max(farthest, _squared(points, i, groups, g))
@@ -185,7 +183,7 @@ def distance_grid(points, farthest, within):
     """Lower bounds of the distance of cells' centres from points.
 
     Args:
-        points: float64 (n, 5), of `group_cubes`: the bounds are those of the boxes around cubes.
+        points: float64 (n, 4), of `group_cubes`: the bounds are those of the boxes around cubes.
         farthest: m; points farther from the origin do not count.
         within: m; bounds matter up to this.
 
@@ -227,7 +225,7 @@ def _write_boxes(points, farthest, boxes):
     """Write the lower and upper corners of cubes' points; returns their number."""
     number = i = 0
     while i < points.shape[0]:
-        end, any_near = int(points[i, 4]), False
+        end, any_near = int(points[i, 3]), False
         for axis in range(3):
             boxes[number, axis], boxes[number, 3 + axis] = np.inf, -np.inf
         for k in range(i, end):

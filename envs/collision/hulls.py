@@ -376,11 +376,10 @@ def group_points(points, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndar
     """Points in groups of neighbours, as the compiled functions take them. Raises ValueError.
 
     Returns:
-        `points`: float64 (n, 5): m, of the first point in each cube the largest distance (m) of
-        the cube's points from it (of others 0), and the index after the cube's last point (of
-        others the next one's). `groups`: float64 (g, 6): the centre (m) of a group, the largest
-        distance (m) of its points from the centre, the index of its first point, and the index
-        after its last. `ball`: float64 (1, `ROW`), a point as a shape. And the points as
+        `points`: float64 (n, 4): m, and of the first point in each cube the index after the cube's
+        last point (of others the next one's). `groups`: float64 (g, 6): the centre (m) of a group,
+        the largest distance (m) of its points from the centre, the index of its first point, and
+        the index after its last. `ball`: float64 (1, `ROW`), a point as a shape. And the points as
         `grid_kernels.blocks_of_points` returns them.
     """
     points = np.asarray(points, dtype=np.float64)
@@ -411,7 +410,7 @@ def group_points(points, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 _NOTHING = np.empty(0, np.float32)
 _NO_POINTS = (
-    np.empty((0, 5)),
+    np.empty((0, 4)),
     np.empty((0, 6)),
     np.zeros((1, ROW)),
     (_NOTHING, _NOTHING, np.empty(0, np.int64)),
