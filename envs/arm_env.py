@@ -17,7 +17,7 @@ from roboarm_nmp.envs.point_images import OBSERVED_COLOUR, point_image
 from roboarm_nmp.envs.robots.control import SUBSTEPS, TIME_STEP
 from roboarm_nmp.envs.robots.robot import Robot
 from roboarm_nmp.envs.robots.rotations import rotation_angle, signed
-from roboarm_nmp.envs.scenes.primitives import ObservedScene, Scene, is_number
+from roboarm_nmp.envs.scenes.primitives import ObservedScene, Scene, SceneDistribution, is_number
 from roboarm_nmp.envs.scenes.wide_scenes.distribution import WideScene
 from roboarm_nmp.envs.subgoals import MAX_STEP
 from roboarm_nmp.envs.world import HOLD_STEPS, MAX_EDGE, World, image_array, why_no_window
@@ -178,7 +178,7 @@ class RoboArmEnv(gym.Env):
 
     def __init__(
         self,
-        scene: Any = None,
+        scene: Scene | SceneDistribution | None = None,
         episodes_per_scene: int = 1,
         goal_type: GoalTypeName = "ee",
         ee_tolerance: float = 0.02,
@@ -199,13 +199,12 @@ class RoboArmEnv(gym.Env):
         for name, check in _CHECKS.items():
             check(name, arguments[name])
         self.scene_distribution: Any = scene if hasattr(scene, "sample") else None
-        """The distribution that scenes are drawn from; None if the scene is fixed."""
+        """The `SceneDistribution` that scenes are drawn from; None if the scene is fixed."""
         self.episodes_per_scene = int(episodes_per_scene)
         self._episodes_in_scene = self.episodes_per_scene
-        if self.scene_distribution is not None:
-            scene = self.scene_distribution.base
+        fixed: Any = scene if self.scene_distribution is None else self.scene_distribution.base
         self.is_animated = hasattr(self.scene_distribution, "animate")
-        self.scene_at_rest = scene
+        self.scene_at_rest = fixed
         """The scene that was drawn last, without motions; the task's, if it is fixed."""
         self.goal_type = goal_type
         self._goal_type = GOAL_TYPES[goal_type]
@@ -228,7 +227,7 @@ class RoboArmEnv(gym.Env):
         if window and (problem := why_no_window()):
             gym.logger.warn(f"render_mode='human' needs a display ({problem}): no window")
             window = False
-        self.world = World(scene, window, drawn=render_mode is not None)
+        self.world = World(fixed, window, drawn=render_mode is not None)
         """The simulated `World`. Change its scene by `set_scene` of the environment."""
 
         joints = self.robot.num_joints
@@ -318,16 +317,6 @@ class RoboArmEnv(gym.Env):
     def sample_feasible(self, rng: np.random.Generator) -> np.ndarray:
         """Like `World.sample_feasible`. It moves the arm, so continue with a reset."""
         return self.world.sample_feasible(rng)
-
-    def check_configuration(self, name: str, configuration: ArrayLike) -> np.ndarray:
-        """Check joint angles, and return them as float32 (n,), rad. The episode goes on.
-
-        Raises ValueError, which names them: they have the wrong size, are not finite, are outside
-        the joint limits or in collision.
-        """
-        configuration = checked_configuration(self.robot, name, configuration)
-        self.world.check_free(**{name: configuration})
-        return configuration
 
     def sample_query(
         self, rng: np.random.Generator, start: np.ndarray | None = None

@@ -23,9 +23,8 @@ from roboarm_nmp.envs.scenes.moving_boxes import (
     BlockedGoals,
     ChasedGoals,
     MovingBoxes,
-    MovingScenes,
 )
-from roboarm_nmp.envs.scenes.primitives import TABLE, Box, Cylinder, Scene
+from roboarm_nmp.envs.scenes.primitives import TABLE, Box, Cylinder, Scene, SceneDistribution
 from roboarm_nmp.envs.scenes.random_boxes import RandomBoxes
 from roboarm_nmp.envs.scenes.wide_scenes.distribution import WideScenes
 from roboarm_nmp.envs.scenes.wide_scenes.names import HELD_OUT
@@ -44,7 +43,7 @@ class Task:
         trainable: False for the tasks that are there to test generalisation (paper: "OOD").
     """
 
-    scene: Scene | RandomBoxes | MixedScenes | Containers | WideScenes | MovingScenes
+    scene: Scene | SceneDistribution
     summary: str
     trainable: bool = True
 

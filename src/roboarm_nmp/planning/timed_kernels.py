@@ -24,14 +24,14 @@ def rows_in_time(motions, centres, shapes, times, rows):
 def free_in_time(states, steps, rule, endpoint_margins, arm, rows, cloud, free):
     """Write whether states (m, n) are free at `steps` (m,) and one step later to `free` (m,).
 
-    `rows`: (t, r, `ROW` or more), of each step. `cloud`: points, groups and ball of `world`.
+    `rows`: (t, r, `ROW` or more), of each step. `cloud`: points, groups, ball and blocks of `world`.
     """
     memory, last = working_memory(arm[0], arm[1]), rows.shape[0] - 1
-    points, groups, ball = cloud
+    points, groups, ball, blocks = cloud
     for i in range(states.shape[0]):
         free[i] = True
         for step in range(steps[i], steps[i] + 2):
-            world = rows[min(step, last)], points, groups, ball
+            world = rows[min(step, last)], points, groups, ball, blocks
             if not is_free(states[i], rule, endpoint_margins, arm, world, memory):
                 free[i] = False
                 break

@@ -38,7 +38,7 @@ POSITION_STEPS = 2**13  # per m, likewise
 DECODED_BY = "field"  # the encoder whose decoded points are shown where an arm uses none
 
 # Colours (red, green, blue).
-FLOOR_COLOUR, TABLE_COLOUR = (205, 205, 205), (196, 178, 150)
+TABLE_COLOUR = (196, 178, 150)
 OBSTACLE_COLOUR, SELECTED_COLOUR = (96, 132, 172), (240, 170, 60)
 TOUCHABLE_COLOUR = (150, 120, 170)
 START_COLOUR, GOAL_COLOUR, CONTACT_COLOUR = (150, 150, 165), (60, 190, 90), (230, 30, 30)
