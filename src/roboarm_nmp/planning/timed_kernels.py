@@ -24,7 +24,7 @@ def rows_in_time(motions, centres, shapes, times, rows):
 def free_in_time(states, steps, rule, endpoint_margins, arm, rows, cloud, free):
     """Write whether states (m, n) are free at `steps` (m,) and one step later to `free` (m,).
 
-    `rows`: (t, r, `ROW` or more), of each step. `cloud`: points, groups, ball and blocks of `world`.
+    `rows`: (t, r, `ROW` or more), of each step. `cloud`: all of `world` but the rows.
     """
     memory, last = working_memory(arm[0], arm[1]), rows.shape[0] - 1
     points, groups, ball, blocks = cloud
