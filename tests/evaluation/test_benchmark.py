@@ -1,5 +1,6 @@
 """roboarm benchmark: entries of policies, functions and programs; replays; hostile entries."""
 
+import hashlib
 import sys
 
 import h5py
@@ -61,6 +62,17 @@ def test_entry_is_verified_and_its_numbers_are_those_of_an_evaluation(entry, tmp
     table = capsys.readouterr().out
     assert "### `chased_goals`\n" in table and "| go-to-goal | " in table
     assert f"| 4, `{row['tasks']['double_walls']['queries_digest'][:8]}` |" in table
+
+
+def test_example_entries_are_rows_of_the_leaderboard(capsys):
+    for folder in (EXAMPLES / "entries").iterdir():
+        row = yaml.safe_load((ROOT / f"benchmarks/leaderboard/{folder.name}.yaml").read_text())
+        claim = yaml.safe_load((folder / "submission.yaml").read_text())
+        for task, of_task in claim["tasks"].items():
+            digest = hashlib.sha256((folder / f"{task}.h5").read_bytes()).hexdigest()
+            assert digest == of_task["sha256"] == row["tasks"][task]["sha256"]
+    assert benchmark.main(["verify", str(EXAMPLES / "entries/td3"), "--workers", "1"]) == 0
+    assert "100 episodes replayed, all as claimed" in capsys.readouterr().out
 
 
 def test_episode_of_an_entry_is_shown(entry, tmp_path, capsys, monkeypatch):
