@@ -61,7 +61,7 @@ LINK_DISTANCE_RANGE = 0.3
 """m. Observed link distances are clipped to this, and beyond it their gradient is zero."""
 NOTHING, TABLE, FLOOR, ARM, POINT = -1, -2, -3, -4, -5
 """Values of `SignedDistances.geometry` that are not the index of an obstacle."""
-NO_GRID = np.empty(0, np.float32), np.zeros(3, np.int64), np.zeros(5, np.float32)
+NO_GRID = np.empty(0, np.float32), np.zeros(3, np.int64), np.zeros(4, np.float32)
 EndpointMargins = tuple[ArrayLike, ArrayLike, float]
 """Smaller margins around endpoints: see `CollisionChecker.is_free`."""
 

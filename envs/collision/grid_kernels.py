@@ -189,12 +189,12 @@ def distance_grid(points, farthest, within):
 
     Returns:
         `near`, float32, the square of each cell's bound, row-major; `numbers`, int64 (3,), of cells
-        along x, y, z; `place`, float32 (5,): where the first cell begins, cells per m, and what
-        counts as the square of cells outside of the grid. Without points there are no cells.
+        along x, y, z; `place`, float32 (4,): where the first cell begins, and cells per m. Without
+        points there are no cells.
     """
     boxes = np.empty((points.shape[0], 6))
     number = _write_boxes(points, farthest, boxes)
-    numbers, place = np.zeros(3, np.int64), np.zeros(5, np.float32)
+    numbers, place = np.zeros(3, np.int64), np.zeros(4, np.float32)
     if number == 0:
         return np.empty(0, np.float32), numbers, place
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -212,8 +212,8 @@ def distance_grid(points, farthest, within):
         numbers[axis] = int((high[axis] + reach - low[axis]) / cell) + 1
         place[axis] = low[axis]
     numbers[2] = max(numbers[2], WIDTH)
-    place[3], place[4] = 1.0 / cell, reach * reach
-    near = np.full(numbers[0] * numbers[1] * numbers[2], place[4])
+    place[3] = 1.0 / cell
+    near = np.full(numbers[0] * numbers[1] * numbers[2], np.float32(reach * reach))
     across, along = np.empty(numbers[1]), np.empty(numbers[2] + WIDTH, np.float32)
     for i in range(number):
         _lower(boxes[i], low, cell, reach, numbers, across, along, near)
