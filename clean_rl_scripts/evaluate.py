@@ -99,6 +99,10 @@ class Args:
     """what space counts as that no sensor sees, for `planner` with the geometry source
     `point_cloud` (by default free), and for a policy that draws paths (by default occupied, and
     free only where it finds no path otherwise)"""
+    verify_else: str | None = None
+    """predict the policy's motion in static scenes, and verify it in a point cloud before the arm
+    moves; where that fails, this policy acts instead, e.g. `planner`, one that draws paths, or the
+    policy itself"""
     lookahead: flags.NonNegativeFloat = 0.0
     """s: the safety filter takes distances as they will be after this time, if obstacles continue
     to approach as they do now"""

@@ -146,6 +146,21 @@ def test_own_filter_leaves_a_verified_path_as_it_is_where_nothing_moves(run):
     assert not np.array_equal(actions["own"], actions["another"])
 
 
+def test_a_reactive_motion_is_verified_before_the_arm_moves_or_another_policy_acts():
+    policy = "roadmap-bc-combined-point_cloud-random_boxes_hard-s1"
+    options = {"split": "validation", "num_queries": 6}
+    alone, verified, planned = (
+        evaluate(policy, HARD, verify_else=other, **options) for other in (None, policy, "planner")
+    )
+    assert "verified_rate" not in alone and 0.0 < verified["verified_rate"] < 1.0
+    assert verified["search_rate"] == 0.0 and planned["verify_else"] == "planner"
+    assert planned["search_rate"] == pytest.approx(1.0 - verified["verified_rate"])
+    assert planned["verified_rate"] == planned["success_rate"] == 1.0
+    assert verified["path_length"] < alone["path_length"]  # shortened
+    with pytest.raises(PolicyError, match="goals that contain a configuration"):
+        make_policy("go-to-goal", envs.make(HARD, goal_type="ee"), verify_else="planner")
+
+
 @pytest.mark.parametrize(
     "change", [{"curves": "many"}, {"line": 4}, {"every": 0}, {"curves": [[1.0, 2.0]]}]
 )

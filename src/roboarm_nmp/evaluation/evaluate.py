@@ -107,6 +107,9 @@ class EvaluationOptions:
         unknown: whether space that no sensor sees counts as `free` or `occupied`. With None, a
             policy that draws paths takes it as occupied, and as free only if it finds no path
             otherwise; `planner` with the geometry source `point_cloud` takes it as free.
+        verify_else: predict the policy's motion in static scenes, and verify it before the arm
+            moves. Where that fails, this policy acts: a name or path, of the policy itself, too. It
+            is what `search` and `unknown` then belong to (`policies.predicted`).
         observe_every: steps from one observation of the scene to the next. With None, static scenes
             are observed once (`envs.wrappers.ObservedSceneWrapper`).
         sensor_noise: a `envs.perception.noise.SensorNoise`; None for perfect sensors.
@@ -139,6 +142,7 @@ class EvaluationOptions:
     replan: bool = False
     search: bool = False
     unknown: Unknown | None = None
+    verify_else: str | Path | None = None
     observe_every: int | None = None
     sensor_noise: SensorNoise | None = None
     action_delay: int = 0
@@ -204,9 +208,10 @@ def evaluate(
           whether policy, filter or observations received the ground-truth obstacles;
         - where sensors observe a static scene once, `unobserved_share`: the mean share of the
           arm's motion that passes through space that no sensor sees;
-        - of a policy that draws paths, `verified_rate`, and with `search` the `search_rate`: the
-          shares of queries with a verified path, and of those for which one was searched for;
-        - `replan`, `search`, `observe_every`, `sensor_noise` (a dict), where they were given.
+        - of a policy that draws paths, or with `verify_else`, `verified_rate`: the share of queries
+          with a verified path; with `search` or `verify_else` `search_rate`, the share of queries
+          for which one was searched for;
+        - `replan`, `search`, `verify_else`, `observe_every`, `sensor_noise` (a dict), where given.
 
     Raises:
         EvaluationError: the policy, the task or the queries cannot be used.
@@ -337,6 +342,7 @@ class _Job:
             replan=options.replan,
             search=options.search,
             unknown=options.unknown,
+            verify_else=options.verify_else,
         )
         return env, begin
 
@@ -739,13 +745,18 @@ def _summary(job: _Job, outcomes: list[Outcome]) -> dict[str, Any]:
         result["unobserved_share"] = _mean(outcomes, "unobserved_share")
     if options.replan:
         result["replan"] = True
-    if policy not in BASELINES and outcomes[0]["plan_found"] is not None:
+    if outcomes[0]["plan_found"] is not None and (
+        policy not in BASELINES or options.verify_else is not None
+    ):
         result["verified_rate"] = sum(outcome["plan_found"] for outcome in outcomes) / count
         result["planning_seconds"] = _mean(outcomes, "planning_seconds")
     if options.unknown:
         result["unknown"] = options.unknown
     if options.search:
         result["search"] = True
+    if options.verify_else is not None:
+        result["verify_else"] = str(options.verify_else)
+    if options.search or options.verify_else is not None:
         result["search_rate"] = sum(outcome["searched"] for outcome in outcomes) / count
     return result
 

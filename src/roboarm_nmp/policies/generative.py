@@ -105,7 +105,7 @@ class Generative:
                 if found is not None:
                     path, verified = found, True
                     break
-        act = _follow_gently(self._robot.denormalise(path), self._robot)
+        act = follow_gently(self._robot.denormalise(path), self._robot)
         return EpisodePolicy(act, verified, searched)
 
 
@@ -277,7 +277,7 @@ def draw_path(
         rng: a NumPy Generator.
     """
     start, goal = ends
-    near = _margins_near(checker, ends)
+    near = margins_near(checker, ends)
     if checker.is_motion_free(start, goal, MARGINS[0], endpoint_margins=near[0]):
         return ends, True
     drawn = np.empty((0, *paths.curves.shape[:1], len(ends[0])), np.float32)
@@ -300,7 +300,7 @@ def draw_path(
     for margin, ends_near in zip(MARGINS, near, strict=True):
         found = _assembled(paths, checker, knots[-2 * DRAWS :], margin, ends_near)
         if found is not None:
-            found = _finished(checker, found, margin, ends_near, rng)
+            found = finished_path(checker, found, margin, ends_near, rng)
         if found is not None:
             return found, True
     knots = knots[np.argsort(paths.lacking(drawn), kind="stable")[:DRAWS]]
@@ -313,7 +313,7 @@ def search_path(
 ) -> np.ndarray | None:
     """As `draw_path`, a path that is searched for, and verified; None if there is none."""
     start, goal = ends
-    for margin, near in zip(MARGINS, _margins_near(checker, ends), strict=True):
+    for margin, near in zip(MARGINS, margins_near(checker, ends), strict=True):
         path, _ = checker.find_path(
             start, goal, rng, margin, endpoint_margins=near, max_checks=SEARCH_CHECKS
         )
@@ -322,13 +322,13 @@ def search_path(
     return None
 
 
-def _margins_near(checker, ends):
+def margins_near(checker, ends):
     """For each of `MARGINS`, the smaller margins near start and goal, where there is less room."""
     room = checker.signed_distances(ends, within=2.0 * MARGINS[0]).distance.min(-1) - 1e-5
     return [(ends, np.minimum(room, margin), MARGIN_GROWTH) for margin in MARGINS]
 
 
-def _follow_gently(path, robot):
+def follow_gently(path, robot):
     """As `follow_path`, but with half as long steps near start and goal, which may be tight."""
     targets = subgoals(path, robot)
     last = len(targets) - 1
@@ -353,7 +353,7 @@ def _shortest_free(paths, checker, knots, margin, near, rng):
         free = checker.first_free_path(knots, orders, margin, endpoint_margins=near)
         if free == len(knots):
             break
-        path = _finished(checker, knots[free], margin, near, rng)
+        path = finished_path(checker, knots[free], margin, near, rng)
         if path is not None:
             return path
         knots, orders = knots[free + 1 :], orders[free + 1 :]
@@ -396,7 +396,7 @@ def _assembled(paths, checker, knots, margin, near):
     return None
 
 
-def _finished(checker, path, margin, near, rng):
+def finished_path(checker, path, margin, near, rng):
     """A path (k, n) shortened; None where it touches something between its configurations."""
     states, room, growth = near
     rules = Rules(

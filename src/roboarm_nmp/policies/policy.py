@@ -18,7 +18,7 @@ class EpisodePolicy(NamedTuple):
 
     act: act(observation) -> action (n,); None: the policy gives up.
     plan_found: whether it found a motion; None if it does not look for one.
-    searched: whether it searched for that motion where a network's paths did not do.
+    searched: whether a planner searched for that motion.
     """
 
     act: Policy | None

@@ -186,6 +186,7 @@ def make_policy(
     replan: bool = False,
     search: bool = False,
     unknown: "Unknown | None" = None,
+    verify_else: str | Path | None = None,
 ) -> BeginEpisode:
     """A policy in an environment: a function (query's number, `Query`) -> `EpisodePolicy`.
 
@@ -215,10 +216,27 @@ def make_policy(
         unknown: what space counts as that no sensor sees: `free` or `occupied`. None: for a policy
             that draws paths, occupied, and free only where it finds no path otherwise; for
             `planner` with the geometry source `point_cloud`, free.
+        verify_else: a policy, one of `BASELINES` or a name or path. The motion of the first policy
+            is then predicted in each static scene, and verified before the arm moves; where that
+            fails, this one acts, to which `search` and `unknown` then apply (`policies.predicted`).
 
     Raises:
         PolicyError: the policy cannot act in this environment.
     """
+    if verify_else is not None:
+        return _verified(
+            make_policy(
+                policy, env, seed, tries, time_limit, geometry_source, safety_filter, replan
+            ),
+            make_policy(
+                find_policy(verify_else)[0],
+                *(env, seed, tries, time_limit, geometry_source),
+                search=search,
+                unknown=unknown,
+            ),
+            env,
+            seed,
+        )
     as_observed = None
     if isinstance(policy, Method):
         begin = policy.begin(env, seed)
@@ -288,6 +306,16 @@ def _replanned(begin, env, seed, geometry_source):
         return begun._replace(act=ReplanWhenStuck(begun.act, replanning, goal))
 
     return begin_replanned
+
+
+def _verified(begin, otherwise, env, seed):
+    # Here, because Numba takes a while to import.
+    from roboarm_nmp.policies.predicted import Predicted
+
+    try:
+        return Predicted(begin, otherwise, env, seed)
+    except ValueError as error:
+        raise PolicyError(f"verify_else: {error}") from error
 
 
 def _translated(begin, goals):

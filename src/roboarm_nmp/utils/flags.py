@@ -33,7 +33,7 @@ T = TypeVar("T")
 # The groups of `--help`, in its order, and the flags in each. Flags of other names are in OTHERS.
 OTHERS = "algorithm"
 GROUPS = {
-    "policy": ("policy", "tries", "time_limit", "replan", "search", "unknown"),
+    "policy": ("policy", "tries", "time_limit", "replan", "search", "unknown", "verify_else"),
     "task": (
         *("task", "robot", "start", "goal", "goal_pose", "goal_type", "split", "queries"),
         *("problems", "num_queries", "query", "num"),
