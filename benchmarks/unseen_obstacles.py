@@ -91,6 +91,12 @@ for _name, _policy, _filter, _source in (
 FLOW = "flow, point_cloud"
 CELLS[FLOW] = ["--policy", "flow-combined-point_cloud-wide_scenes-s1"]
 CELLS[f"{FLOW}, search"] = [*CELLS[FLOW], "--search"]
+for _name, _other in (
+    ("itself", CELLS[OBSERVED][1]),
+    ("flow", CELLS[FLOW][1]),
+    ("planner", "planner"),
+):
+    CELLS[f"{OBSERVED}, verified, else {_name}"] = [*CELLS[OBSERVED], "--verify-else", _other]
 # Decoded points are less exact than observed ones.
 CELLS[DECODED] = [*CELLS[DECODED], "--safety-margin", "0.015"]
 PRIVILEGED = "ground truth (privileged)"

@@ -487,13 +487,15 @@ if __name__ == "__main__":
     if args.gamma in (0.0, 1.0):
         fail("--gamma must be between 0 and 1")
     agent = CRL(args, env, device)
+    criterion = "success_rate"  # of the best policy
     # SHARED: run, buffers, episodes
     explore = graphed(agent.explore, device)
     update_critics = graphed(agent.update_critics, device)
     update_actor = graphed(agent.update_actor, device)
     rng = np.random.default_rng(args.seed)
     buffer = HerReplayBuffer(env, BUFFER_SIZE, args, rng)
-    progress = {"updates": 0, "demos_injected": 0, "evaluated": 0, "best": -1.0, "best_step": 0}
+    progress = {"best": -1.0, "best_success": -1.0, "best_step": 0}
+    progress |= {"updates": 0, "demos_injected": 0, "evaluated": 0}
     state = {"agent": agent, "buffer": buffer, "rng": rng, "progress": progress}
     state["actor_optimizer"] = agent.actor_optimizer
     state["critic_optimizer"] = agent.critic_optimizer
@@ -531,12 +533,14 @@ if __name__ == "__main__":
                 run.log_video("eval/episode", images)
             run.interruptible = False
             progress["evaluated"] = run.step
-            if result["success_rate"] >= progress["best"]:
-                progress |= {"best": result["success_rate"], "best_step": run.step}
+            if result[criterion] >= progress["best"]:
+                progress |= {"best": result[criterion], "best_step": run.step}
+                progress["best_success"] = result["success_rate"]
                 os.replace(latest, run.folder / "policy.onnx")
             observations, _ = envs.reset(seed=reset_seeds(args, run.step))
             returns[:] = contacts[:] = 0.0
-        reached = args.stop_at_success is not None and progress["best"] >= args.stop_at_success
+        best = progress["best_success"]
+        reached = args.stop_at_success is not None and best >= args.stop_at_success
         if run.step >= args.total_timesteps or reached:
             break
 
@@ -601,4 +605,4 @@ if __name__ == "__main__":
             run.save()
     envs.close()
     run.save()  # a longer run, which continues this one, knows its best policy
-    finish(run, test, progress["best"], progress["best_step"])
+    finish(run, test, progress["best_success"], progress["best_step"])

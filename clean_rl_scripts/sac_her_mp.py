@@ -97,7 +97,8 @@ class Args(RunArgs, EnvArgs):
     """end an episode of the training at the first contact; as every step costs 1, a contact then
     costs less than a long way to the goal, unless --contact-cost makes up for it"""
     contact_cost: flags.NonNegativeFloat = 0.0
-    """taken off the reward of each step with a contact"""
+    """taken off the reward of each step with a contact; the best policy is then the one with the
+    highest collision-free success"""
     updates_per_step: flags.NonNegativeFloat = 0.5
     """updates of the critics per environment step (CleanRL: 1)"""
     batch_size: flags.PositiveInt = 256
@@ -439,13 +440,15 @@ if __name__ == "__main__":
 
     # ALGO LOGIC: the agent
     agent = SAC(args, env, device)
+    criterion = "collision_free_success_rate" if args.contact_cost else "success_rate"
     # SHARED: run, buffers, episodes
     explore = graphed(agent.explore, device)
     update_critics = graphed(agent.update_critics, device)
     update_actor = graphed(agent.update_actor, device)
     rng = np.random.default_rng(args.seed)
     buffer = HerReplayBuffer(env, BUFFER_SIZE, args, rng)
-    progress = {"updates": 0, "demos_injected": 0, "evaluated": 0, "best": -1.0, "best_step": 0}
+    progress = {"best": -1.0, "best_success": -1.0, "best_step": 0}
+    progress |= {"updates": 0, "demos_injected": 0, "evaluated": 0}
     state = {"agent": agent, "buffer": buffer, "rng": rng, "progress": progress}
     state["actor_optimizer"] = agent.actor_optimizer
     state["critic_optimizer"] = agent.critic_optimizer
@@ -483,12 +486,14 @@ if __name__ == "__main__":
                 run.log_video("eval/episode", images)
             run.interruptible = False
             progress["evaluated"] = run.step
-            if result["success_rate"] >= progress["best"]:
-                progress |= {"best": result["success_rate"], "best_step": run.step}
+            if result[criterion] >= progress["best"]:
+                progress |= {"best": result[criterion], "best_step": run.step}
+                progress["best_success"] = result["success_rate"]
                 os.replace(latest, run.folder / "policy.onnx")
             observations, _ = envs.reset(seed=reset_seeds(args, run.step))
             returns[:] = contacts[:] = 0.0
-        reached = args.stop_at_success is not None and progress["best"] >= args.stop_at_success
+        best = progress["best_success"]
+        reached = args.stop_at_success is not None and best >= args.stop_at_success
         if run.step >= args.total_timesteps or reached:
             break
 
@@ -553,4 +558,4 @@ if __name__ == "__main__":
             run.save()
     envs.close()
     run.save()  # a longer run, which continues this one, knows its best policy
-    finish(run, test, progress["best"], progress["best_step"])
+    finish(run, test, progress["best_success"], progress["best_step"])

@@ -119,6 +119,15 @@ def test_run_writes_result_policy_and_tensorboard_events(finished_run, trainer):
     assert "hyperparameters/text_summary" in events.Tags()["tensors"]
 
 
+def test_where_contacts_cost_something_the_best_policy_makes_the_fewest(tmp_path, monkeypatch):
+    zeros, rates = dict.fromkeys(RESULTS, 0.0), ((0.5, 0.1), (0.4, 0.2))
+    found = (zeros | {"success_rate": a, "collision_free_success_rate": b} for a, b in rates)
+    monkeypatch.setattr("roboarm_nmp.evaluation.evaluate.evaluate", lambda *_, **__: next(found))
+    run = run_script("td3_her_mp", tmp_path, "--contact-cost", "1", "--test-queries", "0")
+    result = json.loads((run / "result.json").read_text())
+    assert (result["policy_step"], result["validation_success_rate"]) == (600, 0.4)
+
+
 def test_saved_policy_is_the_running_average_and_acts_without_the_script(
     finished_run, trainer, short_episodes
 ):
