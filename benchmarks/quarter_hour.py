@@ -1,4 +1,4 @@
-"""What each algorithm reaches in 15 minutes of one core: the fixed tasks, goal by goal.
+"""What each algorithm reaches in 15 minutes of one core, on tasks with a fixed scene.
 
     python benchmarks/quarter_hour.py                          # all cells: 18 hours of one core
     python benchmarks/quarter_hour.py --tasks boxes --only sac crl --seeds 1 --workers 2
@@ -7,7 +7,7 @@ A cell trains with the flags of `RECIPES` until 15 minutes of processor time are
 demonstrations and evaluating 100 validation queries now and then are part of them. The best policy
 by validation then solves 1,000 test queries, without a safety filter. What is done is kept in
 benchmarks/results/quarter_hour.json and skipped; a cell that was interrupted begins again. The
-table of docs/benchmark/results.md has the mean of the seeds that are done.
+table of docs/lab_notebook.md has the mean of the seeds that are done.
 """
 
 import datetime
@@ -101,6 +101,11 @@ def cell(algorithm, task, seed, minutes, folder):
     return {name: found[name] for name in names} | {"date": str(datetime.date.today())}
 
 
+def load_results():
+    """Dict of task -> dict of cell's name -> its result."""
+    return json.loads(FILE.read_text()) if FILE.exists() else {}
+
+
 def quarter_hour_table(results):
     """Markdown: success and collision-free success, mean and range over seeds."""
     head = ["algorithm", "goal", *(f"`{task}`" for task in get_args(Task))]
@@ -126,7 +131,7 @@ def quarter_hour_table(results):
 def main():
     args = tyro.cli(Args, description=__doc__)
     flags.check(args)
-    results = json.loads(FILE.read_text()) if FILE.exists() else {}
+    results = load_results()
     kept = args.minutes == MINUTES
     lock = threading.Lock()
 

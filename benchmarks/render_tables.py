@@ -10,6 +10,7 @@ import json
 
 import baselines
 import paper_tables
+import quarter_hour
 import unseen_obstacles
 from markdown_tables import NOTHING, ROOT, csv_tables, interval, share, table, write
 
@@ -79,6 +80,7 @@ def all_tables():
         **baselines.tables(others, unseen),
         **unseen_obstacles.tables(unseen, unseen_obstacles.others_results(others)),
         "leaderboard": leaderboard(ROOT / "benchmarks" / "leaderboard"),
+        "quarter_hour": quarter_hour.quarter_hour_table(quarter_hour.load_results()),
         **csv_tables(),
     }
 

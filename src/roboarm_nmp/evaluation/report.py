@@ -81,6 +81,7 @@ def _settings(result):
         "safety filter": _safety_filter(result["safety_filter"]),
         "replans": "when stuck" if result.get("replan") else None,
         "searches": "where no path is verified" if result.get("search") else None,
+        "verified, else": result.get("verify_else"),
         "observed every": f"{observe_every} steps" if observe_every else None,
         "sensor noise": ", ".join(f"{name} {value:g}" for name, value in noise.items()) or None,
         "time limit": None if limit is None else f"{limit:g} s per query",

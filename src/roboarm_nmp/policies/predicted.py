@@ -36,15 +36,17 @@ class Predicted:
         seed: of the random numbers that shorten paths, >= 0; each query has its own generator.
 
     Raises:
-        ValueError: goals without a configuration, or observations with velocities or with link
-            distances in `observation`, which are not predicted.
+        ValueError: goals without a configuration, actions that are not displacements, or velocities
+            or link distances in `observation`, which are not predicted.
     """
 
     def __init__(self, begin: BeginEpisode, otherwise: BeginEpisode, env: RoboArmEnv, seed: int):
         if not GOAL_TYPES[env.goal_type].has_configuration or env.action_mode != "relative":
-            raise ValueError("motions are predicted with goals that contain a configuration")
-        appends = getattr(env, "appends_link_distances", False)
-        if env.velocities or appends:
+            raise ValueError(
+                "motions are predicted for goals that contain a configuration, and actions that "
+                "are displacements"
+            )
+        if env.velocities or getattr(env, "appends_link_distances", False):
             raise ValueError("neither velocities nor appended link distances are predicted")
         self._begin = begin
         self._otherwise = otherwise
