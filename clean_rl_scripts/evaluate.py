@@ -181,9 +181,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _check_baseline_flags(args):
     """Raise ValueError for flags of another baseline, which would have no effect."""
-    if args.tries != TRIES and args.policy != "via-points":
+    policies = {args.policy, args.verify_else}
+    if args.tries != TRIES and "via-points" not in policies:
         raise ValueError("--tries is for via-points")
-    if args.time_limit != TIME_LIMIT and args.policy not in OMPL_PLANNERS:
+    if args.time_limit != TIME_LIMIT and policies.isdisjoint(OMPL_PLANNERS):
         raise ValueError(f"--time-limit is for {' and '.join(OMPL_PLANNERS)}")
 
 

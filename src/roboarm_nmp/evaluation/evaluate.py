@@ -481,6 +481,8 @@ def _in_use(policy, options):
         source = env["geometry_source"] = source or POINT_CLOUD
     elif policy in CHECKING or options.replan:
         source = source or GROUND_TRUTH
+    elif options.verify_else is not None:
+        source = source or POINT_CLOUD
     elif options.geometry_source is not None:
         raise EvaluationError(
             "geometry_source is for via-points, planner, a safety filter, replanning, and policies "
@@ -690,7 +692,7 @@ def _summary(job: _Job, outcomes: list[Outcome]) -> dict[str, Any]:
     options = job.options
     policy = job.policy
     count = len(outcomes)
-    checks = policy in CHECKING or options.replan
+    checks = options.replan or policy in CHECKING or options.verify_else in CHECKING
     is_random = checks or policy == "random" or options.safety_filter
     result = {
         "policy": getattr(policy, "__name__", str(policy)),
@@ -719,7 +721,7 @@ def _summary(job: _Job, outcomes: list[Outcome]) -> dict[str, Any]:
         if policy == "via-points":
             result["free_motion_rate"] = len(solved) / count
     packages = ["pybullet", "onnxruntime", "torch", "numpy"]
-    if policy in OMPL_PLANNERS:
+    if policy in OMPL_PLANNERS or options.verify_else in OMPL_PLANNERS:
         packages.append("ompl")
     result |= {
         "env": options.env,
@@ -730,7 +732,7 @@ def _summary(job: _Job, outcomes: list[Outcome]) -> dict[str, Any]:
         "safety_filter": None,
         "seed": options.seed if is_random else None,
         "tries": options.tries if policy == "via-points" else None,
-        "time_limit": options.time_limit if policy in OMPL_PLANNERS else None,
+        "time_limit": options.time_limit if "ompl" in packages else None,
         "action_delay": job.delay,
         "versions": {"python": platform.python_version()},
     }
