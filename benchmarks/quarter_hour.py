@@ -1,6 +1,6 @@
 """What each algorithm reaches in 15 minutes of one core, on tasks with a fixed scene.
 
-    python benchmarks/quarter_hour.py                          # all cells: 18 hours of one core
+    python benchmarks/quarter_hour.py                          # all 54 cells
     python benchmarks/quarter_hour.py --tasks boxes --only sac crl --seeds 1 --workers 2
 
 A cell trains with the flags of `RECIPES` until 15 minutes of processor time are over: loading

@@ -84,7 +84,8 @@ class Args:
     geometry_source: str | None = None
     """where `planner`, `via-points`, `replanning`, the safety filter and the policy's observations
     take the obstacles from: `ground_truth`, `point_cloud`, or an encoder with a decoder (a name or
-    path); by default the policy's own, otherwise `ground_truth`"""
+    path); by default the policy's own, otherwise `ground_truth`, and with --verify-else
+    `point_cloud`"""
     safety_margin: flags.NonNegativeFloat | None = None
     """put a safety filter with this margin (m) around the policy, e.g. 0.01; 0 for no filter; by
     default the filter that the policy includes, if any"""

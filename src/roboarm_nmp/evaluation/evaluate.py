@@ -97,7 +97,7 @@ class EvaluationOptions:
             > 0.
         geometry_source: where `planner`, `via-points`, the safety filter and the policy's
             observations take the obstacles from (`envs.perception.geometry_source`); None for the
-            policy's own, otherwise `ground_truth`.
+            policy's own, otherwise `ground_truth`, and with `verify_else` `point_cloud`.
         safety_filter: a `policies.safety_filter.SafetyFilter` around the policy; None for the one
             that the policy includes, if any; False for none.
         replan: whenever the policy is stuck, follow a plan for a while, among the obstacles of the

@@ -223,8 +223,8 @@ def _planner(
                 goal_pose=goal_pose,
             )
         except PlanningError:
-            return EpisodePolicy(None, plan_found=False, searched=True)
-        return EpisodePolicy(follow_path(path, env.robot), plan_found=True, searched=True)
+            return EpisodePolicy(None, plan_found=False)
+        return EpisodePolicy(follow_path(path, env.robot), plan_found=True)
 
     return begin
 

@@ -18,7 +18,7 @@ class EpisodePolicy(NamedTuple):
 
     act: act(observation) -> action (n,); None: the policy gives up.
     plan_found: whether it found a motion; None if it does not look for one.
-    searched: whether a planner searched for that motion.
+    searched: whether it searched for that motion where a network's did not do.
     """
 
     act: Policy | None

@@ -1,6 +1,6 @@
 """Reactive policies whose motion is predicted, and verified before the arm moves.
 
-    begin = Predicted(begin, otherwise, env, seed)     # `registry.make_policy` makes it
+    begin = Predicted(begin, otherwise, env, seed=0)     # `registry.make_policy` makes it
     act, verified, searched = begin(number, query)
 
 A policy that chooses one small motion after the other, with its safety filter if it has one, is run
@@ -34,13 +34,21 @@ class Predicted:
         otherwise: what begins an episode where no predicted motion is verified.
         env: the `RoboArmEnv`, whose goals are configurations.
         seed: of the random numbers that shorten paths, >= 0; each query has its own generator.
+        searches: whether `otherwise` always searches, as planners do.
 
     Raises:
         ValueError: goals without a configuration, actions that are not displacements, or velocities
             or link distances in `observation`, which are not predicted.
     """
 
-    def __init__(self, begin: BeginEpisode, otherwise: BeginEpisode, env: RoboArmEnv, seed: int):
+    def __init__(
+        self,
+        begin: BeginEpisode,
+        otherwise: BeginEpisode,
+        env: RoboArmEnv,
+        seed: int = 0,
+        searches: bool = False,
+    ):
         if not GOAL_TYPES[env.goal_type].has_configuration or env.action_mode != "relative":
             raise ValueError(
                 "motions are predicted for goals that contain a configuration, and actions that "
@@ -52,6 +60,7 @@ class Predicted:
         self._otherwise = otherwise
         self._env = env
         self._seed = seed
+        self._searches = searches
 
     def __call__(self, number: int, query: Query) -> EpisodePolicy:
         robot = self._env.robot
@@ -71,7 +80,8 @@ class Predicted:
                 if path is not None:
                     return EpisodePolicy(follow_gently(robot.denormalise(path), robot), True)
         begun = self._otherwise(number, query)
-        return begun._replace(plan_found=bool(begun.plan_found))
+        searched = self._searches or begun.searched
+        return begun._replace(plan_found=bool(begun.plan_found), searched=searched)
 
     def _predict(self, act: Policy, query):
         """The states (k, n), normalised, from start to goal; None if the arm does not arrive."""

@@ -24,6 +24,7 @@ from roboarm_nmp.networks.network_file import Network, load_network
 from roboarm_nmp.networks.untrusted import NetworkError
 from roboarm_nmp.policies.baselines import (
     BASELINES,
+    CHECKING,
     OMPL_PLANNERS,
     REPLANNING,
     TIME_LIMIT,
@@ -236,6 +237,7 @@ def make_policy(
             ),
             env,
             seed,
+            searches=verify_else in CHECKING,
         )
     as_observed = None
     if isinstance(policy, Method):
@@ -308,12 +310,12 @@ def _replanned(begin, env, seed, geometry_source):
     return begin_replanned
 
 
-def _verified(begin, otherwise, env, seed):
+def _verified(begin, otherwise, env, seed, searches):
     # Here, because Numba takes a while to import.
     from roboarm_nmp.policies.predicted import Predicted
 
     try:
-        return Predicted(begin, otherwise, env, seed)
+        return Predicted(begin, otherwise, env, seed, searches)
     except ValueError as error:
         raise PolicyError(f"verify_else: {error}") from error
 
